@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nmpm.cli.options import HelpFormatter, add_data_options, check_at_least, check_picture, data_options
-from nmpm.data.inspection.findings import Finding, Severity, merge_findings
 from nmpm.errors import ConfigError, DataError, NmpmError
 
 if TYPE_CHECKING:
     from nmpm.data.convert import Options
     from nmpm.data.grid_rule import GridCost
     from nmpm.data.inspection import Inspection, Range
+    from nmpm.data.inspection.findings import Finding
     from nmpm.data.loading.sources import FolderSource
 
 _WIDTH = 100
@@ -65,6 +65,7 @@ def run(words: list[str]) -> None:
 
 def _inspect(source: FolderSource, damage: list[str], arguments: argparse.Namespace) -> None:
     from nmpm.data.inspection import inspect
+    from nmpm.data.inspection.findings import Finding, Severity
 
     inspection = inspect(source, arguments.trajectories)
     damaged = (Finding("unreadable", Severity.CONTRADICTION, problem) for problem in damage)
@@ -224,6 +225,8 @@ def _item(text: str) -> list[str]:
 
 
 def _merged(inspection: Inspection) -> tuple[Finding, ...]:
+    from nmpm.data.inspection.findings import merge_findings
+
     return merge_findings(inspection.findings, sum(split.inspected for split in inspection.splits.values()))
 
 

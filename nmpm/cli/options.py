@@ -89,6 +89,13 @@ def add_out_option(parser: argparse.ArgumentParser, default: Path) -> None:
     )
 
 
+def add_split_option(parser: argparse.ArgumentParser, option: str) -> None:
+    """Add the option `--split` of data that another option or argument names."""
+    parser.add_argument(
+        "--split", choices=["train", "valid", "test"], help=f"of {option}, if it has several (default: test)"
+    )
+
+
 def check_device(name: str) -> None:
     """Raise ConfigError if a `--device` cannot run rollouts, as torch's "meta", or this machine does not have it."""
     from nmpm._support.devices import DEVICES, find_device
@@ -133,13 +140,20 @@ def check_folder(option: str, path: Path) -> None:
 
 def check_input(option: str, path: Path) -> None:
     """Raise ConfigError if a file does not exist, or is a folder."""
-    obstacle = name_obstacle(path)
-    if not obstacle and path.is_dir():
-        obstacle = f"it is a folder; name a file in it, such as {path / 'test.h5'}."
-    elif not obstacle and not path.is_file():
-        obstacle = "there is no such file."
-    if obstacle:
+    check_exists(option, path)
+    if path.is_dir():
+        raise ConfigError(f"{option} {path}: it is a folder; name a file in it.")
+
+
+def check_exists(option: str, path: Path) -> None:
+    """Raise ConfigError if there is no such file or folder."""
+    if obstacle := name_obstacle(path) or ("" if path.exists() else "there is no such file or folder."):
         raise ConfigError(f"{option} {path}: {obstacle}")
+
+
+def derived_name(path: Path, suffix: str) -> Path:
+    """A file's path with another suffix; of a folder, its name in the working directory."""
+    return (Path(path.resolve().name) if path.is_dir() else path).with_suffix(suffix)
 
 
 def add_data_options(parser: argparse.ArgumentParser) -> None:

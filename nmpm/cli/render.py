@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from nmpm.cli.options import HelpFormatter, check_input
+from nmpm.cli.options import HelpFormatter, add_split_option, check_exists, derived_name
 from nmpm.errors import ConfigError
 
 _EXAMPLES = """\
@@ -25,22 +25,24 @@ def run(words: list[str]) -> None:
         epilog=_EXAMPLES,
         formatter_class=HelpFormatter,
     )
-    parser.add_argument("file", type=Path, help="HDF5 file of nmpm rollout or of a dataset in native format")
+    parser.add_argument("file", type=Path, help="a rollout, or data of any format that nmpm inspect reads")
+    add_split_option(parser, "FILE")
     parser.add_argument("--trajectory", type=int, default=0, help="index of the trajectory (default: 0, the first)")
     parser.add_argument("--family", help="meaning of type ids if metadata.json lacks it: deepmind, lagrangebench")
     parser.add_argument("--mp4", action="store_true", help="write an MP4 instead of a GIF (pip install nmpm[video])")
     parser.add_argument("--out", type=Path, help="path of the pictures without suffix (default: that of the file)")
     arguments = parser.parse_args(words[1:])
+    from nmpm.data.convert import Options, native_file
     from nmpm.data.format import Split
     from nmpm.viz import write_animation, write_snapshots
     from nmpm.viz.files import read_labelled
     from nmpm.viz.output import check_output
 
-    stem = arguments.out or arguments.file.with_suffix("")
+    stem = arguments.out or derived_name(arguments.file, "")
     picture = stem.with_name(f"{stem.name}.png")
     video = stem.with_name(f"{stem.name}{'.mp4' if arguments.mp4 else '.gif'}")
-    check_input("FILE", arguments.file)
-    split = Split(arguments.file)
+    check_exists("FILE", arguments.file)
+    split = Split(native_file(arguments.file, arguments.split, Options(family=arguments.family)))
     if not 0 <= arguments.trajectory < len(split):
         raise ConfigError(
             f"--trajectory {arguments.trajectory}: {arguments.file} contains trajectories 0 … {len(split) - 1}."

@@ -13,10 +13,11 @@ from nmpm.cli.options import (
     add_model_options,
     add_out_option,
     add_runtime_option,
+    add_split_option,
     add_threads_option,
     check_at_least,
     check_device,
-    check_input,
+    check_exists,
     choose_threads,
     gravity_option,
 )
@@ -35,6 +36,7 @@ _EXAMPLES = """\
 examples:
   nmpm rollout goop --frames 400 --out out.h5            a zoo model, from thrown blocks
   nmpm rollout runs/goop --data test.h5 --trajectory 3   a run's best, from a recorded start
+  nmpm rollout runs/grains --data grains.npz             or from any file or folder that can be trained on
   nmpm rollout runs/goop/checkpoints/last.ckpt
   nmpm rollout goop --out splash.usda                    for Blender; .vtkhdf for ParaView, .csv, …
   nmpm rollout goop --device cuda --runtime auto         on a GPU, by CUDA graphs
@@ -51,7 +53,7 @@ def run(words: list[str]) -> None:
 
     model = load_model(options.model, options.device, options.root).optimized(options.runtime, options.precision)
     choose_threads(model, options.threads)
-    window = None if options.data is None else _recorded(model, options.data, options.trajectory)
+    window = None if options.data is None else _recorded(model, options)
     recorded = 0 if window is None else window.target.shape[1]
     state = _thrown_state(model, options) if window is None else window.initial
     warn_of_start_outside(model.emulator, state.to(model.emulator.device))
@@ -76,8 +78,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--frames", type=int, help="frames to predict (default: 400; with --data, the recording's)")
     add_out_option(parser, Path("out.h5"))
     parser.add_argument(
-        "--data", type=Path, help="start from a trajectory of this HDF5 file (native layout), and print the error"
+        "--data",
+        type=Path,
+        help="start from a trajectory of this file or folder, of any format that nmpm inspect reads, and print the"
+        " error",
     )
+    add_split_option(parser, "--data")
     parser.add_argument("--trajectory", type=int, default=0, help="index in --data (default: 0, the first)")
     parser.add_argument("--seed", type=int, default=0, help="of the thrown blocks (default: 0)")
     parser.add_argument("--particles", type=int, default=1000, help="approximate number to throw (default: 1000)")
@@ -109,7 +115,7 @@ def _check(options: argparse.Namespace) -> None:
     for name, least in (("frames", 1), ("threads", 1), ("particles", 1), ("blocks", 1), ("seed", 0), ("trajectory", 0)):
         check_at_least(f"--{name}", getattr(options, name), least)
     if options.data is not None:
-        check_input("--data", options.data)
+        check_exists("--data", options.data)
         if options.gravity is not None:
             raise ConfigError("--gravity is of thrown blocks: leave it out beside --data, which has its own.")
     find_writer("--out", options.out)
@@ -125,17 +131,21 @@ def _thrown_state(model: Pretrained, options: argparse.Namespace) -> Particles:
         raise ConfigError(f"--particles {options.particles}{blocks}: {error}") from error
 
 
-def _recorded(model: Pretrained, path: Path, index: int) -> Window:
-    from nmpm.data.format import Split, read_metadata
+def _recorded(model: Pretrained, options: argparse.Namespace) -> Window:
+    from nmpm.data.convert import native_file
+    from nmpm.data.convert.native import file_metadata
+    from nmpm.data.format import Split
     from nmpm.data.loading.padded_batch import collate
     from nmpm.data.loading.recording import SplitRecordings
     from nmpm.data.metadata import FAMILIES
     from nmpm.emulator.fields import warn_of_ignored
 
     deepmind = set(model.scene.materials) <= set(FAMILIES["deepmind"].types.values())
-    metadata = read_metadata(path.parent, "deepmind" if deepmind else None)
+    path, index = options.data, options.trajectory
+    split = Split(native_file(path, options.split))
+    metadata = file_metadata(split, "deepmind" if deepmind else None)
     warn_of_ignored(model.scene, metadata.fields)
-    recordings = SplitRecordings(Split(path), metadata, model.scene)
+    recordings = SplitRecordings(split, metadata, model.scene)
     if index >= len(recordings):
         raise ConfigError(f"--trajectory {index}: {path} contains trajectories 0 … {len(recordings) - 1}.")
     if recordings.split.frames(index) < 2:

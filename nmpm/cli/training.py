@@ -197,8 +197,7 @@ EXAMPLES = {
   nmpm fit --config goop.yaml                           simulate data, train, test, draw
   nmpm fit --resume runs/goop                           go on after an interruption
   nmpm fit --config goop.yaml --trainer.max_time 00:00:05 --trainer.default_root_dir runs/short
-  nmpm fit --data.path FOLDER                           on recorded data, by a configuration that nmpm
-                                                        init chooses for them; it is kept in the run
+  nmpm fit --data.path FOLDER                           on your own data, configured as by init
   nmpm fit --config waterdrop.yaml --data.path FOLDER   on recorded data, by another""",
     "validate": """\
   nmpm validate runs/goop                               its best weights""",

@@ -6,13 +6,14 @@ import argparse
 import sys
 from pathlib import Path
 
-from nmpm.cli.options import HelpFormatter, check_at_least, check_input
+from nmpm.cli.options import HelpFormatter, add_split_option, check_at_least, check_exists, derived_name
 
 _EXAMPLES = """\
 examples:
   nmpm view out.h5                                     a rollout, beside the recording of its --data
   nmpm view out.h5 data/test.h5 --truth-trajectory 3   beside another one with the same start
   nmpm view data/test.h5 --trajectory 7 --every 2      a recorded trajectory, every second frame
+  nmpm view tracks.csv --split train                   data of another program
 
 The page needs no network and no nmpm: send it to anybody. Space plays, ? shows the keys.
 """
@@ -26,9 +27,10 @@ def run(words: list[str]) -> None:
         epilog=_EXAMPLES,
         formatter_class=HelpFormatter,
     )
-    parser.add_argument("file", type=Path, help="HDF5 file of nmpm rollout or of a dataset in native format")
-    parser.add_argument("truth", type=Path, nargs="?", help="HDF5 file of what FILE should be; errors are against it")
+    parser.add_argument("file", type=Path, help="a rollout, or data of any format that nmpm inspect reads")
+    parser.add_argument("truth", type=Path, nargs="?", help="what FILE should be; errors are against it")
     parser.add_argument("--trajectory", type=int, default=0, help="index in FILE (default: 0, the first)")
+    add_split_option(parser, "FILE")
     parser.add_argument("--truth-trajectory", type=int, help="index in TRUTH (default: that of --trajectory)")
     parser.add_argument("--every", type=int, default=1, help="show every so many frames (default: 1, all)")
     parser.add_argument("--family", help="meaning of type ids if metadata.json lacks it: deepmind, lagrangebench")
@@ -37,16 +39,18 @@ def run(words: list[str]) -> None:
     check_at_least("--every", arguments.every, 1)
     for name, path in (("FILE", arguments.file), ("TRUTH", arguments.truth)):
         if path is not None:
-            check_input(name, path)
+            check_exists(name, path)
     from nmpm.viz.output import check_output
 
-    out = arguments.out or arguments.file.with_suffix(".html")
+    out = arguments.out or derived_name(arguments.file, ".html")
     check_output(out, (".html",))
+    from nmpm.data.convert import Options, native_file
     from nmpm.viz.viewer import page_of_files
 
     truth_index = arguments.trajectory if arguments.truth_trajectory is None else arguments.truth_trajectory
     truth = (arguments.truth, truth_index) if arguments.truth else None
-    page = page_of_files((arguments.file, arguments.trajectory), truth, arguments.every, arguments.family)
+    shown = (native_file(arguments.file, arguments.split, Options(family=arguments.family)), arguments.trajectory)
+    page = page_of_files(shown, truth, arguments.every, arguments.family)
     page.write(out)
     size = out.stat().st_size / 1e6
     sys.stdout.write(f"wrote {out} ({size:.1f} MB): open it in a browser\n")

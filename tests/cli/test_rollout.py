@@ -6,7 +6,7 @@ import pytest
 
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
-from nmpm.data.format import Split
+from nmpm.data.format import Split, read_metadata
 from nmpm.viz.files import read_labelled
 
 
@@ -62,3 +62,22 @@ def test_a_recording_is_predicted_to_its_end_and_stored_beside(asked, predicted,
     np.testing.assert_array_equal(shown.positions["truth"], recorded[: compared + 2])
     np.testing.assert_allclose(shown.positions["prediction"][:2], recorded[:2], atol=1e-7)
     assert Split(Path("out.h5")).frames(0) == predicted + 2
+
+
+def test_a_rollout_starts_from_data_of_any_form(make_dataset, capsys):
+    """Whose tests are taken unless a split is named; pictures and pages show such data, too."""
+    folder = make_dataset(train=((12, 5),), test=((12, 9),))
+    runs = {name: Split(folder / f"{name}.h5").read(0) for name in ("train", "test")}
+    Path("runs").mkdir()
+    for name, run in runs.items():
+        np.savez(f"runs/{name}.npz", position=run.position, types=run.particle_type)
+    names = ",".join(f"{i}={name}" for i, name in read_metadata(folder).particle_types.items())
+    assert main(["convert", "runs", "copy", "--types", names]) == 0
+    for data, split, expected in (("copy", [], "test"), ("copy", ["--split", "train"], "train"), (folder, [], "test")):
+        assert main(["rollout", "goop", "--data", str(data), *split, "--frames", "4"]) == 0
+        np.testing.assert_allclose(Split(Path("out.h5")).read(0).position[:2], runs[expected].position[:2], atol=1e-7)
+    assert main(["rollout", "goop", "--data", "copy", "--split", "valid"]) == 1
+    assert "--split valid: copy has train, test." in capsys.readouterr().err
+    assert main(["view", "runs/test.npz"]) == 0 == main(["render", "runs", "--split", "train"])
+    assert Path("runs/test.html").exists()
+    assert Path("runs.gif").exists()

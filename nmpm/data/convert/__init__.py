@@ -33,7 +33,7 @@ from nmpm.data.convert.tracks import Tracks
 from nmpm.data.convert.vtk import Vtk
 from nmpm.data.convert.vtkhdf import VtkHdf
 from nmpm.data.convert.xyz import Xyz
-from nmpm.data.format import METADATA_FILE
+from nmpm.data.format import METADATA_FILE, Split, is_native, split_paths
 from nmpm.data.gravity import check_gravity
 from nmpm.errors import ConfigError, DataError
 
@@ -138,6 +138,39 @@ def native_folder(path: Path, options: Options | None = None, format_name: str |
             for note in convert(path, folder, format_name, options):
                 _log.info("%s: %s", path.name, note)
     return folder
+
+
+def native_file(path: Path, split: str | None = None, options: Options | None = None) -> Path:
+    """A file in the native layout with a split of the same data: the path itself, or one of `native_folder`.
+
+    Args:
+        path: A file or folder of any format.
+        split: The tests, or else the first, when left out.
+        options: As for `native_folder`.
+
+    Raises:
+        DataError: if the data cannot be read.
+        ConfigError: if they have no such split.
+    """
+    if _is_native_file(path):
+        if split is not None:
+            raise ConfigError(f"--split {split}: {path} is the file of a split; leave it out, or name the folder.")
+        return path
+    paths = split_paths(path if is_native(path) else native_folder(path, options))
+    if split is not None and split not in paths:
+        raise ConfigError(f"--split {split}: {path} has {', '.join(paths)}.")
+    return paths[split] if split is not None else paths.get("test", next(iter(paths.values())))
+
+
+def _is_native_file(path: Path) -> bool:
+    """Whether a file has the native layout, with its scene described within or beside it."""
+    if not path.is_file():
+        return False
+    try:
+        described = "scene" in Split(path).attributes(0)
+    except (DataError, IndexError):
+        return False
+    return described or (path.parent / METADATA_FILE).is_file()
 
 
 def _fingerprint(path: Path, options: Options, format_name: str | None) -> str:

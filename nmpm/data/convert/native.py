@@ -51,7 +51,7 @@ class NativeFiles(DatasetFormat):
     def recognises(self, path: Path) -> bool:
         files = split_files(path, *_PATTERNS)
         try:
-            return bool(files) and bool(_file_metadata(Split(next(iter(files.values()))[0]), None))
+            return bool(files) and bool(file_metadata(Split(next(iter(files.values()))[0]), None))
         except (NmpmError, OSError):
             return False
 
@@ -60,13 +60,14 @@ class NativeFiles(DatasetFormat):
         if not splits:
             raise DataError(f"{path}: no file {' or '.join(_PATTERNS)} there.")
         return ForeignDataset(
-            metadata=options.apply_to(_file_metadata(next(iter(splits.values()))[0], options.family)),
+            metadata=options.apply_to(file_metadata(next(iter(splits.values()))[0], options.family)),
             splits={name: partial(_read_files, files) for name, files in splits.items()},
             counts={name: sum(map(len, files)) for name, files in splits.items()},
         )
 
 
-def _file_metadata(split: Split, family: str | None) -> Metadata:
+def file_metadata(split: Split, family: str | None) -> Metadata:
+    """The metadata of a file's scene, which its trajectories describe, or else those beside it."""
     attributes = split.attributes(0)
     if "scene" in attributes:
         return described_metadata(attributes, split.path, split.frames(0))

@@ -1,30 +1,41 @@
 """Writes trajectories for other programs: a form is one class in one file, by the suffix of the file's name.
 
-`WRITERS` lists them.
+`WRITERS` lists them; they are imported when they write, so that help and refusals need not wait for HDF5.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 from nmpm._support.progress import progress_bar
-from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.write.base import TrajectoryWriter as TrajectoryWriter
-from nmpm.data.write.csv import Csv
-from nmpm.data.write.hdf5 import NativeHdf5, VtkHdf
-from nmpm.data.write.lammps import LammpsDump
-from nmpm.data.write.npz import Npz
-from nmpm.data.write.usd import Usda
-from nmpm.data.write.vtp import VtpSeries
 from nmpm.errors import ConfigError
 
-WRITERS: tuple[TrajectoryWriter, ...] = (NativeHdf5(), VtkHdf(), VtpSeries(), Usda(), LammpsDump(), Npz(), Csv())
-SUFFIXES = ", ".join(writer.suffixes[0] for writer in WRITERS)
+if TYPE_CHECKING:
+    from nmpm.data.format import Metadata, Trajectory
+
+WRITERS = MappingProxyType(
+    {
+        ".h5": "hdf5.NativeHdf5",
+        ".vtkhdf": "hdf5.VtkHdf",
+        ".vtp": "vtp.VtpSeries",
+        ".pvd": "vtp.VtpSeries",
+        ".usda": "usd.Usda",
+        ".lammpstrj": "lammps.LammpsDump",
+        ".npz": "npz.Npz",
+        ".csv": "csv.Csv",
+    }
+)
+"""Module of this folder and class of the writer, by suffix in lower case."""
+SUFFIXES = ", ".join(suffix for suffix in WRITERS if suffix != ".pvd")
 
 
 def is_written_by_suffix(path: Path) -> bool:
     """Whether there is a writer for a path's suffix."""
-    return any(path.suffix.lower() in writer.suffixes for writer in WRITERS)
+    return path.suffix.lower() in WRITERS
 
 
 def find_writer(option: str, path: Path) -> TrajectoryWriter:
@@ -33,12 +44,13 @@ def find_writer(option: str, path: Path) -> TrajectoryWriter:
     Raises:
         ConfigError: naming the option, if there is none for the suffix, or the file cannot be written.
     """
-    for writer in WRITERS:
-        if path.suffix.lower() in writer.suffixes:
-            if obstacle := writer.obstacle(path):
-                raise ConfigError(f"{option} {path}: {obstacle}")
-            return writer
-    raise ConfigError(f"{option} {path}: nothing is written by that suffix; there are {SUFFIXES}.")
+    if not is_written_by_suffix(path):
+        raise ConfigError(f"{option} {path}: nothing is written by that suffix; there are {SUFFIXES}.")
+    module, name = WRITERS[path.suffix.lower()].split(".")
+    writer: TrajectoryWriter = getattr(import_module(f"{__name__}.{module}"), name)()
+    if obstacle := writer.obstacle(path):
+        raise ConfigError(f"{option} {path}: {obstacle}")
+    return writer
 
 
 def write_trajectory(path: Path, trajectory: Trajectory, metadata: Metadata) -> Path:

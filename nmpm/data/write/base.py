@@ -5,10 +5,12 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable
 from pathlib import Path
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from nmpm._support.atomic import file_obstacle
-from nmpm.data.format import Metadata, Trajectory
+
+if TYPE_CHECKING:
+    from nmpm.data.format import Metadata, Trajectory
 
 
 def no_step() -> None:
@@ -19,12 +21,10 @@ class TrajectoryWriter(abc.ABC):
     """Abstract writer of one trajectory into a file that other programs read, one subclass per form.
 
     Attributes:
-        suffixes: Of the files' names, in lower case.
         readers: Programs that open the file, in words.
         holds_all_fields: Also those that are not of particles.
     """
 
-    suffixes: ClassVar[tuple[str, ...]]
     readers: ClassVar[str]
     holds_all_fields: ClassVar[bool] = False
 

@@ -18,7 +18,6 @@ from nmpm.data.write.text import columns, rows
 class Csv(TrajectoryWriter):
     """Columns `frame, time, id, type, x, y[, z], vx, …`, and one for each field."""
 
-    suffixes: ClassVar[tuple[str, ...]] = (".csv",)
     readers: ClassVar[str] = "spreadsheets, pandas, R"
 
     def write(

@@ -19,7 +19,6 @@ from nmpm.data.write.vtkhdf import write_viewable
 class NativeHdf5(TrajectoryWriter):
     """The native layout: a file that all of nmpm reads, and ParaView."""
 
-    suffixes: ClassVar[tuple[str, ...]] = (".h5",)
     readers: ClassVar[str] = "nmpm view, ParaView"
     holds_all_fields: ClassVar[bool] = True
 
@@ -40,7 +39,6 @@ class NativeHdf5(TrajectoryWriter):
 class VtkHdf(NativeHdf5):
     """The same, by the suffix that ParaView knows, with velocities."""
 
-    suffixes: ClassVar[tuple[str, ...]] = (".vtkhdf",)
     readers: ClassVar[str] = "ParaView, nmpm view"
 
     def write(

@@ -16,7 +16,6 @@ from nmpm.data.write.text import columns, rows
 class LammpsDump(TrajectoryWriter):
     """One file of all frames, `id type x y z vx vy vz` and a column for each field; ids begin at 1."""
 
-    suffixes: ClassVar[tuple[str, ...]] = (".lammpstrj",)
     readers: ClassVar[str] = "OVITO, VMD"
 
     def write(

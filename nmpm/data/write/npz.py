@@ -17,7 +17,6 @@ from nmpm.data.write.frames import frame_times
 class Npz(TrajectoryWriter):
     """`position` (T, N, D), `particle_type` (N,), `time` (T,), fields, and facts of the scene; `type_names` by id."""
 
-    suffixes: ClassVar[tuple[str, ...]] = (".npz",)
     readers: ClassVar[str] = "NumPy"
     holds_all_fields: ClassVar[bool] = True
 

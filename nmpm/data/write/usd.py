@@ -26,7 +26,6 @@ class Usda(TrajectoryWriter):
     `timeCodesPerSecond` is 1 / dt. Particles of static types have one position. A truth has points of its own.
     """
 
-    suffixes: ClassVar[tuple[str, ...]] = (".usda",)
     readers: ClassVar[str] = "Blender, Houdini, Omniverse"
 
     def write(

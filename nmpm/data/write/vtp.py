@@ -22,7 +22,6 @@ _VTK_TYPES = {"f4": "Float32", "f8": "Float64", "i8": "Int64"}
 class VtpSeries(TrajectoryWriter):
     """`out.pvd` and beside it the folder `out` of a .vtp per frame."""
 
-    suffixes: ClassVar[tuple[str, ...]] = (".vtp", ".pvd")
     readers: ClassVar[str] = "ParaView, VisIt, PyVista"
 
     def write(

@@ -17,8 +17,9 @@ def view(what: LabelledTrajectories | Path | str, truth: Path | str | None = Non
     """A page that plays trajectories; as the last expression of a notebook's cell it appears below it.
 
     Args:
-        what: Labelled trajectories, or an HDF5 file, whose first trajectory is shown.
-        truth: An HDF5 file whose first trajectory starts in the same way; errors are against it.
+        what: Labelled trajectories, or a file or folder of data, whose first trajectory (of the tests, if there are
+            any) is shown.
+        truth: Data whose first trajectory starts in the same way; errors are against it.
         every: Shows every so many frames.
     """
     if isinstance(what, LabelledTrajectories):
@@ -41,11 +42,12 @@ def page_of_files(
         DataError: if a file cannot be read, or the two do not show the same particles.
         ConfigError: if `every` is below 1.
     """
+    from nmpm.data.convert import native_file
     from nmpm.data.format import Split
     from nmpm.viz.files import combine, read_labelled
 
-    trajectories = read_labelled(Split(shown[0]), shown[1], family)
+    trajectories = read_labelled(Split(native_file(shown[0])), shown[1], family)
     if truth is not None:
-        reference = read_labelled(Split(truth[0]), truth[1], family)
+        reference = read_labelled(Split(native_file(truth[0])), truth[1], family)
         trajectories = combine(reference, trajectories, (str(truth[0]), str(shown[0])))
     return ViewerPage(trajectories, every)

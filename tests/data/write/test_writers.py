@@ -141,7 +141,7 @@ def test_fields_that_frames_cannot_have_are_named():
     assert fields_left_out(made()) == ["misfit"]
 
 
-@pytest.mark.parametrize("suffix", [suffix for writer in WRITERS for suffix in writer.suffixes])
+@pytest.mark.parametrize("suffix", WRITERS)
 def test_writing_again_gives_the_same_bytes_and_leaves_nothing_beside(tmp_path, suffix):
     """And replaces what was there."""
     path, contents = tmp_path / f"out{suffix}", []
