@@ -90,6 +90,24 @@ class TestGravity:
         assert fact.value is None
         assert "differs" in fact.how
 
+    def test_is_likely_where_most_particles_collide(self, rng):
+        runs = [thrown(rng, (0.0, -2.0), frames=30) for _ in range(3)]
+        for run in runs:
+            run[:, 50:] += np.arange(30)[:, None, None] ** 2 * rng.uniform(0, 0.1, run[0, 50:].shape)
+        fact = facts_of(*runs, time=0.1 * np.arange(30)).gravity
+        assert fact.value == pytest.approx((0.0, -2.0), abs=0.01)
+        assert fact.sure == "likely"
+        assert "others collide" in fact.how
+
+    def test_from_the_few_frames_before_most_particles_collide(self, rng):
+        runs = [thrown(rng, (0.0, -2.0), frames=30) for _ in range(3)]
+        for run in runs:
+            collision = rng.uniform(3, 8, run.shape[1])
+            run += np.maximum(np.arange(30)[:, None] - collision, 0)[..., None] * [0, 0.05]
+        fact = facts_of(*runs, time=0.1 * np.arange(30)).gravity
+        assert fact.value == pytest.approx((0.0, -2.0), abs=0.005)
+        assert fact.sure == "measured"
+
     def test_from_flights_after_a_start_at_rest(self, rng):
         runs = []
         for _ in range(3):
@@ -181,13 +199,15 @@ class TestTypes:
         assert (still.trajectory, still.particle, still.count) == (0, 0, 3)
 
     def test_rigid_bodies_that_fall_or_differ_between_trajectories_are_free(self, rng):
-        def run(shift):
-            fluid = thrown(rng, (0.0, -2.0), frames=40)
+        def run(shift, dt=0.1):
+            fluid = thrown(rng, (0.0, -2.0), frames=40, dt=dt)
             return np.concatenate([fluid, rng.uniform(4, 5, (1, 20, 2)) + shift], axis=1)
 
         types, time = np.repeat([0, 7], [144, 20]), 0.1 * np.arange(40)[:, None, None]
         falling = time**2 * [0, -1.0]
         assert facts_of(run(falling), types=types).prescribed_types.value == frozenset()
+        clips = [run(falling / 25 + phase * time, dt=0.02) for phase in range(4)]
+        assert facts_of(*clips, types=types).prescribed_types.value == frozenset()
         differing = [run(np.sin(phase + time) * [0, 1.0]) for phase in (0.0, 1.0)]
         fact = facts_of(*differing, types=types).prescribed_types
         assert fact.value == frozenset()
@@ -296,6 +316,13 @@ class TestConversion:
         assert (metadata.dt, metadata.gravity, scene.materials) == (0.5, (0.0, -7.0), ("jelly",))
         assert scene.domain[0] == scene.bounds[0]
         assert {"gravity", "dt", "boundary"}.isdisjoint(metadata.extra["found"])
+
+    @pytest.mark.parametrize(("types", "how"), [({0: "jelly", 1: "sand"}, None), ({0: "jelly"}, "those of type 1")])
+    def test_names_that_the_user_states_are_not_called_guessed(self, rng, tmp_path, types, how):
+        np.savez(tmp_path / "a.npz", positions=thrown(rng, (0.0, -2.0))[None], types=np.repeat([0, 1], 72))
+        notes = convert(tmp_path / "a.npz", tmp_path / "b", options=Options(types=types))
+        assert [note for note in notes if "particle_types" in note and how is None] == []
+        assert how is None or any(f"guessed: {how} by their ids" in note for note in notes)
 
     def test_types_without_names_are_renumbered(self, rng, tmp_path):
         runs = np.stack([thrown(rng, (0.0, -2.0)) for _ in range(3)])

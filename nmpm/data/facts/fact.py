@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeVar
 
@@ -62,9 +62,15 @@ class Facts:
         names = {*unknown, *({"prescribed_types"} if "static_types" in unknown else ())}
         if "bounds" in unknown and metadata.domain is None:
             names.add("domain")
-        if set(self.particle_types.value) <= set(metadata.particle_types):
+        unnamed = sorted(set(self.particle_types.value) - set(metadata.particle_types))
+        if not unnamed:
             names.discard("particle_types")
-        facts: Mapping[str, Fact[Any]] = {name: fact for name, fact in vars(self).items() if name in names}
+        if metadata.prescribed_types and self.prescribed_types.value <= metadata.prescribed_types:
+            names.discard("prescribed_types")
+        facts: dict[str, Fact[Any]] = {name: fact for name, fact in vars(self).items() if name in names}
+        if "particle_types" in facts and metadata.particle_types:
+            how = f"those of type {', '.join(map(str, unnamed))} {self.particle_types.how}"
+            facts["particle_types"] = replace(self.particle_types, how=how)
         values = {name: fact.value for name, fact in facts.items()}
         if "particle_types" in values:
             values["particle_types"] = values["particle_types"] | metadata.particle_types

@@ -19,7 +19,7 @@ from nmpm.data.facts.parabolas import AGREE, Flight, fit_parabolas, join, shared
 _FRAMES = (8, 4)  # of a parabola
 _LONG = 32  # frames in which a flight must be straight
 _SHARE = 0.2  # of the particles that move, that must be in free flight
-_CLEAR = 0.5  # the same where flights that differ show that gravity does
+_CLEAR = 0.5  # the same where they alone show gravity, or that it differs
 _MOST = 0.6  # of the trajectories must agree
 _MEAN_AGREE = 0.05  # of gravity
 _LATER, _LATER_FRAMES, _LATER_SHARE = 24, 5, 0.05  # parabolas over a whole trajectory, their frames, share that agrees
@@ -78,9 +78,9 @@ def find_gravity(tracks: Sequence[Track], spacing: float, dt: float, closed: boo
 
 
 def _first_flight(track: Track, spacing: float) -> Flight | None:
-    """The flight in first frames: over few of them where few agree, over many where it is straight so far."""
+    """The flight in first frames: over few of them where more agree, over many where it is straight so far."""
     flights = [track.flight(0, frames, spacing) for frames in _FRAMES]
-    best = max((flight for flight in flights if flight), key=lambda flight: flight.share > _SHARE, default=None)
+    best = max((flight for flight in flights if flight), key=lambda flight: min(flight.share, _CLEAR), default=None)
     if best is not None and best.straight:
         half = _LONG // 2
         halves = [track.flight(start, half, spacing) for start in (0, half)]
@@ -123,7 +123,8 @@ def _from_flights(flights: Sequence[Flight], number: int, dt: float) -> Fact[tup
     means = sum(_same(flight.mean, flight.acceleration, AGREE) for flight in flights)
     how = f"free flight of {share:.0%} of the particles in first frames of {len(flights)} of {number} trajectories"
     how = f"{how}, the mean acceleration of all in {means}"
-    return _gravity(vectors, dt, how, "measured" if len(flights) > 1 or means else "likely")
+    clear = means or (share > _CLEAR and len(flights) > 1)
+    return _gravity(vectors, dt, how if clear else f"{how}: others collide", "measured" if clear else "likely")
 
 
 def _gravity(vectors: Sequence[np.ndarray], dt: float, how: str, sure: Sure) -> Fact[tuple[float, ...] | None]:

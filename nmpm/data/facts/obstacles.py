@@ -100,7 +100,7 @@ def _has_program(paths: Sequence[np.ndarray], others: Sequence[np.ndarray], spac
     start = np.mean([np.diff(centre[:_START], 2, axis=0).mean(axis=0) for centre in centres], axis=0)
     falls = np.concatenate([np.diff(other[:_START], 2, axis=0).reshape(-1, len(start)) for other in others])
     falls = falls[np.isfinite(falls).all(axis=1)]
-    if steady or not len(falls):
+    if not len(falls):
         return True
     fall = np.median(falls, axis=0)
     size = float(np.linalg.norm(fall))
