@@ -8,8 +8,8 @@ import pytest
 from nmpm.data.convert import ForeignDataset, Options, convert, open_dataset
 from nmpm.data.convert.conversion import write_native
 from nmpm.data.facts import FactFinder, Facts, find_facts
-from nmpm.data.facts.domain import domain_fact
-from nmpm.data.facts.periodic import roundest
+from nmpm.data.facts.boundaries import domain_fact
+from nmpm.data.facts.open_ends import roundest
 from nmpm.data.format import Metadata, Split, Trajectory, read_metadata, write_split
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError

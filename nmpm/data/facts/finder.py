@@ -7,13 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nmpm.data.facts.boundaries import Axis, Ends, boundary_fact, bounds_fact, find_axes
-from nmpm.data.facts.domain import domain_fact
+from nmpm.data.facts.boundaries import Axis, Ends, boundary_fact, bounds_fact, domain_fact, find_axes
 from nmpm.data.facts.fact import Fact, Facts
 from nmpm.data.facts.free_fall import Track, find_gravity
 from nmpm.data.facts.obstacles import TypeMotion, name_types, prescribed_fact
-from nmpm.data.facts.openings import Openings
-from nmpm.data.facts.periodic import unwrap
+from nmpm.data.facts.open_ends import Openings, unwrap
 from nmpm.data.facts.sample import Samples
 from nmpm.data.facts.timing import TimeSteps
 from nmpm.data.facts.volume import find_particle_volume

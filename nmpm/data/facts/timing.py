@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nmpm.data.facts.fact import Fact
-from nmpm.data.facts.periodic import roundest
+from nmpm.data.facts.open_ends import roundest
 from nmpm.data.facts.sample import Sample
 from nmpm.data.times import uneven_step, usual_step
 

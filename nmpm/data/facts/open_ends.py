@@ -1,9 +1,9 @@
-"""Periodic axes: particles that leave at one end come back at the other, one period away, with the same velocity."""
+"""Ends of axes without walls: periods, one of which apart particles come back, and openings, where tracks end."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,10 @@ _JUMPS = 3  # fewer suffice where their period is the extent
 _FULL = 0.01  # of the period: how far the extent may differ from it then
 _WRAPS = 0.5  # of the long steps
 _ROUNDING = 1e-4  # of the period: errors that are rounded away
+_ZONE = 0.1  # of the extent at each end: where particles that leave an axis are seen last
+_GONE = 5  # frames after which an absent particle has left; another may be in its place later
+_MOST = 0.6  # of the ends of tracks: if so many are in the zones of some axes, those axes explain them
+_ENRICHED = 2.0  # times as many ends of tracks in the zones as positions
 
 
 @dataclass(frozen=True)
@@ -95,3 +99,43 @@ def unwrap(position: np.ndarray, periods: np.ndarray) -> np.ndarray:
     unwrapped: np.ndarray = position.copy()
     unwrapped[1:] -= np.cumsum(np.nan_to_num(turns), axis=0) * periods
     return unwrapped
+
+
+@dataclass(frozen=True)
+class Openings:
+    """The axes along which particles leave."""
+
+    axes: frozenset[int]
+    ends: int  # tracks that end before the last frame
+    starts: int  # tracks that begin after the first one
+    anywhere: bool  # whether tracks end in mid volume as well
+
+
+def find_openings(positions: Sequence[np.ndarray], low: np.ndarray, high: np.ndarray) -> Openings:
+    """The axes along which particles leave, in positions (F, N, D) of each trajectory, NaN where absent.
+
+    A track that ends near an end of an axis left there; where most tracks end elsewhere, as in a measured volume,
+    particles come and go along all axes.
+    """
+    dim = len(low)
+    last = np.concatenate([np.empty((0, dim)), *(_track_ends(each) for each in positions)])
+    first = sum(len(_track_ends(each[::-1])) for each in positions)
+    if not len(last):
+        return Openings(frozenset(), 0, first, anywhere=False)
+    some = np.concatenate([each[np.isfinite(each).all(axis=2)][::7] for each in positions])
+    zone = _ZONE * (high - low)
+    near = (last < low + zone) | (last > high - zone)
+    usual = ((some < low + zone) | (some > high - zone)).mean(axis=0)
+    enriched = np.flatnonzero(near.mean(axis=0) > np.maximum(_ENRICHED * usual, _ZONE))
+    if near[:, enriched].any(axis=1).mean() > _MOST:
+        return Openings(frozenset(enriched.tolist()), len(last), first, anywhere=False)
+    return Openings(frozenset(range(dim)), len(last), first, anywhere=True)
+
+
+def _track_ends(position: np.ndarray) -> np.ndarray:
+    """The last positions (K, D) of particles that are then absent for five frames, or until the end."""
+    present = np.isfinite(position).all(axis=2)
+    ends = present[:-1].copy()
+    for later in range(1, min(_GONE, len(ends)) + 1):
+        ends[: len(present) - later] &= ~present[later:]
+    return np.asarray(position[:-1][ends], np.float64)
