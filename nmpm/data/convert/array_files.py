@@ -22,8 +22,8 @@ from nmpm._support.bounded_files import EXPANSION, NPZ_ERRORS, check_regular, ex
 from nmpm._support.messages import one_line
 from nmpm.data.convert.base import split_files
 from nmpm.data.convert.named_arrays import USUAL_NAMES, ArrayLike, Arrays, describe, plain_name
-from nmpm.data.convert.run_arrays import RunArrays, group_runs
-from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, RunFiles, placeholder_metadata
+from nmpm.data.convert.run_arrays import group_runs
+from nmpm.data.convert.run_files import Facts, Run, RunFiles
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
 from nmpm.errors import DataError, NmpmError
@@ -63,35 +63,18 @@ class ArrayFiles(RunFiles):
             groups = list(group_runs(arrays, str(run.file)))
         return [group.frames for group in groups for _ in range(group.count)][run.index]
 
-    def facts(self, file: Path) -> tuple[Metadata, frozenset[str], tuple[str, ...]]:
+    def facts(self, file: Path) -> Facts:
         with open_arrays(file) as arrays:
-            first = next(group_runs(arrays, str(file)))
-            return array_facts(first)
+            return next(group_runs(arrays, str(file))).facts()
 
     def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:
         wanted, offset = set(indices), 0
-        ids = {name: i for i, name in metadata.particle_types.items()}
         with open_arrays(file) as arrays:
             for group in group_runs(arrays, str(file)):
                 for run in range(group.count):
                     if offset + run in wanted:
-                        yield group.read(run, metadata.dim, ids)
+                        yield group.read(run, metadata)
                 offset += group.count
-
-
-def array_facts(first: RunArrays) -> tuple[Metadata, frozenset[str], tuple[str, ...]]:
-    """Metadata from the arrays of a run, names of those that are unknown, and notes on how arrays are read."""
-    run = first.positions(0)
-    dim = 2 if is_flat(run) else run.shape[2]
-    stated = first.stated_facts(dim)
-    known = {*stated, *({"gravity"} if "gravity" in first.roles else ())}
-    flat = ("z is 0 everywhere: the data are 2-D.",) if dim < run.shape[2] else ()
-    return placeholder_metadata(dim, **stated), EVERYTHING_UNKNOWN - known, (*first.notes(), *flat)
-
-
-def is_flat(position: np.ndarray) -> bool:
-    """Whether the z of (T, N, 3) positions is 0 wherever a particle is."""
-    return position.shape[-1] == 3 and not np.nan_to_num(position[..., 2]).any()
 
 
 def is_array_folder(path: Path) -> bool:
@@ -146,28 +129,11 @@ def _hdf5_arrays(file: Any, path: Path) -> Iterator[tuple[str, ArrayLike]]:
         for name in group:
             item = group.get(name)
             if isinstance(item, h5py.Dataset) and item.shape is not None:
-                yield prefix + name, Hdf5Array(item, f"{path}: {prefix}{name}")
+                check_stored_size(item, f"{path}: {prefix}{name}")
+                yield prefix + name, item
             elif isinstance(item, h5py.Group) and name != "VTKHDF":
                 groups.append(item)
         pending += reversed(groups)
-
-
-class Hdf5Array:
-    """A dataset of an open HDF5 file.
-
-    Args:
-        dataset: The dataset.
-        where: For messages.
-    """
-
-    def __init__(self, dataset: Any, where: str) -> None:
-        self._dataset, self._where = dataset, where
-        self.shape: tuple[int, ...] = dataset.shape
-        self.dtype: np.dtype[Any] = dataset.dtype
-
-    def __getitem__(self, rows: Any) -> Any:
-        check_stored_size(self._dataset, self._where)
-        return self._dataset[rows]
 
 
 class NpzArray:
@@ -210,6 +176,13 @@ class NpzArray:
             return whole
         size = math.prod(self.shape[1:])
         return self._read(rows * size, size).reshape(self.shape[1:])
+
+    def pickled(self) -> bytes:
+        """The content of an array of objects."""
+        with self._named_errors():
+            self._file.seek(self._start)
+            content: bytes = self._file.read()
+            return content
 
     def _read(self, first: int, count: int) -> np.ndarray:
         with self._named_errors():

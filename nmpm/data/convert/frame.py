@@ -8,16 +8,22 @@ from functools import partial
 
 import numpy as np
 
-from nmpm.data.convert.named_arrays import USUAL_NAMES, plain_name
+from nmpm.data.convert.named_arrays import (
+    AXES,
+    COMPONENTS,
+    USUAL_NAMES,
+    by_plain_name,
+    component_names,
+    plain_name,
+    with_meaning,
+)
 from nmpm.scene import Boundary, Interval
 
-AXES = "xyz"
-"""Names of the axes."""
-
-_COMPONENTS = ("vx vy vz", "velocityx velocityy velocityz", "velx vely velz", "velocity0 velocity1 velocity2", "u v w")
-
 ARRAY_NAMES = frozenset(
-    {*" ".join(_COMPONENTS).split(), *(n for key in ("id", "types", "active", "velocity") for n in USUAL_NAMES[key])}
+    {
+        *(name for spelling in COMPONENTS["velocity"] for name in spelling),
+        *(name for meaning in ("id", "types", "active", "velocity") for name in USUAL_NAMES[meaning]),
+    }
 )
 """Names of arrays with a meaning, in lower case without separators."""
 
@@ -83,15 +89,11 @@ class Layout:
 
     def notes(self) -> tuple[str, ...]:
         """For the user."""
-        flat = tuple(
-            f"{AXES[axis]} is {value:g} everywhere: 2-D data, of {' and '.join(AXES[i] for i in self.axes)}."
-            for axis, value in self.constant.items()
-        )
-        ids = f"Particles are matched by the array {self.id_name!r}." if self.id_name else ""
-        left_out = (
-            f"Left out, as they are not numbers of particles: {', '.join(self.left_out)}." if self.left_out else ""
-        )
-        return tuple(note for note in (*flat, ids, left_out) if note)
+        kept = " and ".join(AXES[axis] for axis in self.axes)
+        notes = [f"{AXES[axis]} is {value:g} everywhere: 2-D data, of {kept}." for axis, value in self.constant.items()]
+        notes += [f"Particles are matched by the array {self.id_name!r}."] if self.id_name else []
+        left_out = ", ".join(self.left_out)
+        return (*notes, *([f"Left out, as they are not numbers of particles: {left_out}."] if left_out else []))
 
 
 def wrap(position: np.ndarray, box: Sequence[Interval] | None, boundary: Sequence[Boundary] | None) -> np.ndarray:
@@ -145,9 +147,7 @@ def _name_of(
     arrays: Mapping[str, np.ndarray], meaning: str, convert: Callable[[np.ndarray], np.ndarray | None]
 ) -> str | None:
     """The first array whose name has a meaning and that fits; None if there is none."""
-    by_name = {plain_name(name): name for name in reversed([*arrays])}
-    names = (by_name[usual] for usual in USUAL_NAMES[meaning] if usual in by_name)
-    return next((name for name in names if convert(arrays[name]) is not None), None)
+    return next((name for name in with_meaning(meaning, arrays) if convert(arrays[name]) is not None), None)
 
 
 def _take(
@@ -183,14 +183,12 @@ def _vectors(values: np.ndarray, axes: Sequence[int]) -> np.ndarray | None:
 
 def _take_components(arrays: dict[str, np.ndarray], axes: Sequence[int]) -> np.ndarray | None:
     """Removes a velocity that is stored as an array per axis, and returns it (N, D)."""
-    scalars = {
-        plain_name(name): name for name, values in arrays.items() if values.ndim == 1 and values.dtype.kind in "iuf"
-    }
-    for components in map(str.split, _COMPONENTS):
-        if all(components[axis] in scalars for axis in axes):
-            columns = {axis: arrays.pop(scalars[name]) for axis, name in enumerate(components) if name in scalars}
-            return np.stack([columns[axis] for axis in axes], axis=1)
-    return None
+    plain = by_plain_name(name for name, values in arrays.items() if values.ndim == 1 and values.dtype.kind in "iuf")
+    names = component_names(plain, "velocity")
+    if len(names) <= max(axes):
+        return None
+    columns = [arrays.pop(name) for name in names]
+    return np.stack([columns[axis] for axis in axes], axis=1)
 
 
 def _scalars(name: str, values: np.ndarray) -> Iterable[tuple[str, np.ndarray]]:

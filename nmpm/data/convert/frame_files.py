@@ -19,7 +19,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
+from itertools import islice, repeat
 from pathlib import Path
 from typing import ClassVar
 
@@ -36,8 +36,8 @@ from nmpm.data.convert.base import (
 )
 from nmpm.data.convert.frame import Frame, Layout, ParticleArrays, flat_axes
 from nmpm.data.convert.frame_stack import FrameStack
-from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, apply_family, divide, keep_whole, placeholder_metadata
-from nmpm.data.format import Trajectory
+from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, open_divided, placeholder_metadata
+from nmpm.data.format import SPLITS, Metadata, Trajectory
 from nmpm.errors import DataError
 
 _DEPTH = 3  # of folders
@@ -56,11 +56,6 @@ class FrameRun(Run):
     def present(self) -> tuple[Path, ...]:
         """The files that are there."""
         return tuple(file for file in self.files if file is not None)
-
-    @property
-    def frame_files(self) -> tuple[Path | None, ...]:
-        """The files of the frames to take."""
-        return self.files if self.part is None else self.files[self.part.start : self.part.stop]
 
 
 class FrameFormat(DatasetFormat):
@@ -91,8 +86,8 @@ class FrameFormat(DatasetFormat):
 
     def open(self, path: Path, options: Options) -> ForeignDataset:
         runs, gaps = self._runs(path)
-        splits, divided = divide(runs)
-        first = self._first_frames(next(iter(splits.values()))[0])
+        run = next((run for split in SPLITS for run in runs if run.split == split), runs[0])
+        first = self._first_frames(run)
         layout = Layout.of(first, self._type_ids(first, runs))
         stated = {"bounds": first[0].box, "boundary": first[0].boundary}
         facts = {
@@ -100,15 +95,9 @@ class FrameFormat(DatasetFormat):
         }
         names = {number: name for name, number in layout.type_ids.items()}
         metadata = placeholder_metadata(len(layout.axes), particle_types=names, **facts)
-        metadata, unknown = apply_family(metadata, EVERYTHING_UNKNOWN - set(facts), options)
-        dataset = ForeignDataset(
-            options.apply_to(metadata),
-            {split: partial(self._read_all, each, layout) for split, each in splits.items()},
-            (*layout.notes(), *gaps, *divided, *self.notes(first, options)),
-            {split: len(each) for split, each in splits.items()},
-            unknown=unknown,
-        )
-        return keep_whole(dataset, runs, partial(self._read_all, layout=layout))
+        notes = (*layout.notes(), *gaps, *self.notes(first, options))
+        read = partial(self._read_all, layout=layout)
+        return open_divided({"all": runs}, (metadata, EVERYTHING_UNKNOWN - set(facts), notes), read, options)
 
     def _folders(self, path: Path) -> Iterator[tuple[Path, list[Path]]]:
         """Yields folders with files of this format and these files; of a file its own."""
@@ -170,14 +159,8 @@ class FrameFormat(DatasetFormat):
 
         def ids(frame: Frame) -> dict[str, int]:
             arrays = ParticleArrays.of(frame, range(frame.position.shape[1]), None)
-            if arrays.type_names is None:
-                return {}
-            names, index = np.unique(arrays.type_names, return_index=True)
-            return (
-                dict.fromkeys(names.tolist(), -1)
-                if arrays.type is None
-                else dict(zip(names.tolist(), arrays.type[index].tolist(), strict=True))
-            )
+            names = [] if arrays.type_names is None else arrays.type_names.tolist()
+            return dict(zip(names, repeat(-1) if arrays.type is None else arrays.type.tolist(), strict=False))
 
         named = ids(first[0])
         if named:
@@ -187,30 +170,26 @@ class FrameFormat(DatasetFormat):
             return {name: number for number, name in enumerate(sorted(named))}
         return named if len(set(named.values())) == len(named) else {}
 
-    def _read_all(self, runs: Sequence[FrameRun], layout: Layout) -> Iterator[Trajectory]:
+    def _read_all(self, runs: Sequence[FrameRun], metadata: Metadata, layout: Layout) -> Iterator[Trajectory]:
+        stated = {name: number for number, name in metadata.particle_types.items()}
+        layout = replace(layout, type_ids=stated | dict(layout.type_ids))
         for run in runs:
-            yield self._read(run, layout)
-
-    def _read(self, run: FrameRun, layout: Layout) -> Trajectory:
-        many = len(run.files) == 1
-        total = (run.frames if run.part is None else len(run.part)) or None
-        stack = FrameStack(layout, total)
-        with progress_bar(f"Reading {run.file.name}", total) as advance:
-            for frame, where in self._frames_of_many(run) if many else self._frames_of_files(run):
-                if frame is None:
-                    stack.add_absent()
-                else:
+            total = (run.frames if run.part is None else len(run.part)) or None
+            stack = FrameStack(layout, total)
+            with progress_bar(f"Reading {run.file.name}", total) as advance:
+                for frame, where in self._frames_of(run):
                     stack.add(frame, where)
-                advance()
-        return stack.trajectory(str(run.file))
+                    advance()
+            yield stack.trajectory(str(run.file))
 
-    def _frames_of_many(self, run: FrameRun) -> Iterator[tuple[Frame, str]]:
-        part = (0, None) if run.part is None else (run.part.start, run.part.stop)
-        for number, frame in islice(enumerate(self.frames(run.file)), *part):
-            yield frame, f"{run.file}, frame {number}"
-
-    def _frames_of_files(self, run: FrameRun) -> Iterator[tuple[Frame | None, str]]:
-        for file in run.frame_files:
+    def _frames_of(self, run: FrameRun) -> Iterator[tuple[Frame | None, str]]:
+        """Yields the frames to take, None where one is missing, and where they are."""
+        part = slice(None) if run.part is None else slice(run.part.start, run.part.stop)
+        if len(run.files) == 1:
+            for number, frame in islice(enumerate(self.frames(run.present[0])), part.start, part.stop):
+                yield frame, f"{run.file}, frame {number}"
+            return
+        for file in run.files[part]:
             yield (None, "") if file is None else (self._only_frame(file, run), str(file))
 
     def _only_frame(self, file: Path, run: FrameRun) -> Frame:

@@ -7,8 +7,8 @@ import logging
 import numpy as np
 
 from nmpm._support.messages import one_line
-from nmpm.data.convert.frame import AXES, Frame, Layout, ParticleArrays
-from nmpm.data.convert.named_arrays import plain_name
+from nmpm.data.convert.frame import Frame, Layout, ParticleArrays
+from nmpm.data.convert.named_arrays import AXES, plain_name, type_ids
 from nmpm.data.format import Trajectory
 from nmpm.errors import DataError
 
@@ -44,50 +44,45 @@ class FrameStack:
         self._empty = ""
         self._left_out: set[str] = set()
 
-    def add_absent(self) -> None:
-        """Adds a frame in which there is no particle, at an unknown time."""
-        self._reserve(self._count + 1, self._particles)
-        self._times.append(np.nan)
-        self._count += 1
-
-    def add(self, frame: Frame, where: str) -> None:
-        """Adds a frame; errors name it by `where`.
+    def add(self, frame: Frame | None, where: str) -> None:
+        """Adds a frame, at an unknown time and without particles where it is None; errors name it by `where`.
 
         Raises:
             DataError: if its particles cannot be matched with those of the frames before.
         """
-        if not len(frame.position):
-            self._empty = self._empty or where
-            self.add_absent()
-        else:
+        if frame is not None and len(frame.position):
             self._add_particles(frame, where)
-        self._times[-1] = np.nan if frame.time is None else frame.time
+        else:
+            self._empty = self._empty or (where if frame else "")
+            self._reserve(self._count + 1, self._particles)
+        self._times.append(np.nan if frame is None or frame.time is None else frame.time)
+        self._count += 1
 
     def _add_particles(self, frame: Frame, where: str) -> None:
         arrays = ParticleArrays.of(frame, self._axes, self._id_name)
-        position = self._position(frame.position, where)
+        has_types = arrays.type is not None or arrays.type_names is not None
+        values = {"position": self._position(frame.position, where), **arrays.scalars}
         first = not self._first
         if first:
-            self._first, self._has_ids = where, arrays.id is not None
-            self._has_types = arrays.type is not None or arrays.type_names is not None
-        slots = self._slots(arrays.id, len(position), where)
-        self.add_absent()
-        t = self._count - 1
-        types = self._frame_types(arrays, where)
-        absent = np.zeros(len(position), bool)
+            self._first, self._has_ids, self._has_types = where, arrays.id is not None, has_types
+        for what, has, before in (("ids", arrays.id is not None, self._has_ids), ("types", has_types, self._has_types)):
+            if has != before:
+                raise DataError(f"{where}: only some frames have {what} of particles ({self._first} differs).")
+        slots = self._slots(arrays.id, len(frame.position), where)
+        self._reserve(self._count + 1, self._particles)
+        types = arrays.type
+        if types is None and arrays.type_names is not None:
+            types = type_ids(arrays.type_names, self._type_ids, where)
         if types is not None:
             self._merge_types(types, slots, where)
-            absent |= types == _ABSENT_TYPE
+            values["position"][types == _ABSENT_TYPE] = np.nan
         if arrays.present is not None:
-            absent |= ~arrays.present
-        position[absent] = np.nan
-        self._set("position", t, slots, position, first)
+            values["position"][~arrays.present] = np.nan
         if arrays.velocity is not None:
-            self._set("velocity", t, slots, arrays.velocity, first)
-        for name, values in arrays.scalars.items():
-            self._set(name, t, slots, values, first)
-        velocity = set() if arrays.velocity is None else {"velocity"}
-        self._leave_out({"position", *velocity, *arrays.scalars}, where)
+            values["velocity"] = arrays.velocity
+        for name, array in values.items():
+            self._set(name, slots, array, first)
+        self._leave_out(set(values), where)
 
     def _position(self, values: np.ndarray, where: str) -> np.ndarray:
         """(N, D) float32 of the axes that are kept."""
@@ -113,8 +108,6 @@ class FrameStack:
 
     def _slots(self, ids: np.ndarray | None, count: int, where: str) -> np.ndarray | slice:
         """Indices of a frame's particles in the trajectory; makes room for those that are new."""
-        if (ids is not None) != self._has_ids:
-            raise DataError(f"{where}: only some frames have ids of particles ({self._first} differs).")
         if ids is None:
             if self._empty or self._particles not in (0, count):
                 other = f"{self._particles} in {self._first}" if self._particles else f"none in {self._empty}"
@@ -151,14 +144,14 @@ class FrameStack:
             self._types = np.concatenate([self._types, np.full(particles - self._particles, _ABSENT_TYPE)])
             self._particles = particles
 
-    def _set(self, name: str, t: int, slots: np.ndarray | slice, values: np.ndarray, first: bool) -> None:
+    def _set(self, name: str, slots: np.ndarray | slice, values: np.ndarray, first: bool) -> None:
         """Sets a frame's values; arrays that only later frames have are left out."""
         if first:
             exact = values.dtype.kind in "iu" and values.dtype.itemsize > 2
             shape = (self._frames, self._room, *values.shape[1:])
             self._values[name] = np.full(shape, np.nan, np.float64 if exact else np.float32)
         if name in self._values:
-            self._values[name][t, slots] = values
+            self._values[name][self._count, slots] = values
 
     def _leave_out(self, names: set[str], where: str) -> None:
         """Drops arrays that are not in all frames, with a warning; `names` are those of a frame."""
@@ -166,21 +159,6 @@ class FrameStack:
             _log.warning("%s: the array %r is not in all frames; it is left out.", where, one_line(name, 60))
             self._left_out.add(name)
             self._values.pop(name, None)
-
-    def _frame_types(self, arrays: ParticleArrays, where: str) -> np.ndarray | None:
-        """(N,) type ids of a frame."""
-        if (arrays.type is not None or arrays.type_names is not None) != self._has_types:
-            raise DataError(f"{where}: only some frames have types of particles ({self._first} differs).")
-        if arrays.type is not None or arrays.type_names is None:
-            return arrays.type
-        names, index = np.unique(arrays.type_names, return_inverse=True)
-        unknown = sorted(set(names.tolist()) - set(self._type_ids))
-        if unknown:
-            raise DataError(
-                f"{where}: the type {one_line(unknown[0], 40)!r} is not in the first frame of any run"
-                f" ({', '.join(self._type_ids)})."
-            )
-        return np.array([self._type_ids[name] for name in names.tolist()])[index]
 
     def _merge_types(self, types: np.ndarray, slots: np.ndarray | slice, where: str) -> None:
         """Notes the types of particles that are there for the first time, and checks the others."""

@@ -7,7 +7,6 @@ per trajectory. NumPy stores objects as a pickle, which is read by the restricte
 
 from __future__ import annotations
 
-import math
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,13 +14,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from nmpm._support.bounded_files import NPZ_ERRORS
 from nmpm._support.messages import one_line
-from nmpm.data.convert.array_files import npz_members
+from nmpm.data.convert.array_files import NpzArray, npz_members
 from nmpm.data.convert.base import FileFormat, Options
 from nmpm.data.convert.restricted_pickle import load_pickled, number_array
 from nmpm.data.format import METADATA_FILE, Metadata, Trajectory, read_metadata
-from nmpm.errors import DataError, NmpmError
+from nmpm.errors import DataError
 
 _ALL = "gns_data"
 
@@ -53,21 +51,9 @@ class GnsNpz(FileFormat):
 
 def _array(path: Path, name: str, where: str) -> Any:
     """The content of a member; objects are read by the restricted unpickler."""
-    try:
-        with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:
-            version = np.lib.format.read_magic(file)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, fortran, kind = read(file)
-            data = file.read()
-        if kind.hasobject:
-            return load_pickled(data, where)
-        if len(data) != math.prod(shape) * kind.itemsize:
-            raise ValueError(f"{len(data)} bytes are not those of an array of {kind} and shape {shape}")
-        return np.frombuffer(data, kind).reshape(shape, order="F" if fortran else "C")
-    except NmpmError:
-        raise
-    except NPZ_ERRORS as error:
-        raise DataError(f"{where}: cannot be read ({one_line(error)}). Copy or download the file again.") from error
+    with zipfile.ZipFile(path) as archive:
+        array = NpzArray(archive, name, where)
+        return load_pickled(array.pickled(), where) if array.dtype.hasobject else array[()]
 
 
 def _trajectory(row: Any, where: str) -> Trajectory:

@@ -16,8 +16,9 @@ import numpy as np
 
 from nmpm._support.messages import counted, one_line
 from nmpm.data.convert.base import Options
-from nmpm.data.convert.frame import AXES, Frame, wrap
+from nmpm.data.convert.frame import Frame, wrap
 from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.data.convert.named_arrays import AXES
 from nmpm.data.convert.text_lines import Lines, complete_frames, open_lines, parse_columns
 from nmpm.errors import DataError
 from nmpm.scene import Boundary, Interval

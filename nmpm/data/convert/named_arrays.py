@@ -7,11 +7,18 @@ N particles, D = 1 to 3 axes; R runs may be stacked in front.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Any, Protocol
 
 import numpy as np
+
+from nmpm._support.messages import one_line
+from nmpm.errors import DataError
+
+AXES = "xyz"
+"""Names of the axes."""
 
 USUAL_NAMES: Mapping[str, tuple[str, ...]] = {
     "position": (
@@ -40,6 +47,19 @@ USUAL_NAMES: Mapping[str, tuple[str, ...]] = {
     "boundary": ("boundary", "boundaries", "boundaryconditions"),
 }  # fmt: skip
 """Names of arrays by what they mean, in lower case without separators; the first that fits is taken."""
+
+COMPONENTS: Mapping[str, tuple[Sequence[str], ...]] = {
+    "position": tuple(
+        [prefix + axis for axis in axes]
+        for prefix in ("", "pos", "position", "p", "coord", "coordinates", "points", "centroid")
+        for axes in (AXES, "012")
+    ),
+    "velocity": (
+        *([prefix + axis for axis in axes] for prefix in ("v", "vel", "velocity") for axes in (AXES, "012")),
+        "uvw",
+    ),
+}
+"""Names of arrays that hold one axis each."""
 
 
 class ArrayLike(Protocol):
@@ -87,9 +107,51 @@ def as_text(values: np.ndarray) -> np.ndarray:
     )
 
 
+def type_ids(names: np.ndarray, ids: Mapping[str, int], where: str) -> np.ndarray:
+    """The ids of types by their names, in the shape of `names`; raises a DataError for a name without id."""
+    unique, index = np.unique(names, return_inverse=True)
+    unknown = sorted(set(unique.tolist()) - set(ids))
+    if unknown:
+        name = one_line(unknown[0], 40)
+        raise DataError(
+            f"{where}: the type {name!r} does not occur in the first run ({', '.join(ids)}); give it an id: --types"
+            f" {len(ids)}={name}."
+        )
+    return np.array([ids[name] for name in unique.tolist()], np.int64)[index].reshape(names.shape)
+
+
+def drop_axes(position: np.ndarray, dim: int, where: str) -> np.ndarray:
+    """The first axes of (…, D) positions; raises a DataError if the others are not 0 everywhere."""
+    if position.shape[-1] < dim:
+        raise DataError(f"{where}: positions have {position.shape[-1]} axes, those of the first run have {dim}.")
+    if position[..., dim:].any():
+        raise DataError(f"{where}: z is 0 in the first run, but not here. Give all runs the same number of axes.")
+    return position[..., :dim]
+
+
 def plain_name(name: str) -> str:
     """A name in lower case without separators."""
     return re.sub(r"[^a-z0-9]", "", name.lower())
+
+
+def by_plain_name(names: Iterable[str]) -> dict[str, str]:
+    """Names by their plain form; of equal ones the first."""
+    return {plain_name(name): name for name in reversed(list(names))}
+
+
+def with_meaning(meaning: str, names: Iterable[str]) -> list[str]:
+    """Those of the names that have a meaning, the more usual ones first."""
+    plain = by_plain_name(names)
+    return [plain[usual] for usual in USUAL_NAMES[meaning] if usual in plain]
+
+
+def component_names(plain: Mapping[str, str], meaning: str) -> tuple[str, ...]:
+    """The arrays, by plain name, of the axes x, y and perhaps z of a position or velocity; () if there are none."""
+    for spelling in COMPONENTS[meaning]:
+        present = [plain[name] for name in takewhile(plain.__contains__, spelling)]
+        if len(present) > 1:
+            return tuple(present)
+    return ()
 
 
 def describe(arrays: Arrays, most: int = 6) -> str:
@@ -106,32 +168,22 @@ def can_be_positions(array: ArrayLike) -> bool:
 
 def position_name(arrays: Arrays) -> str | None:
     """Name of the positions: a usual one, or else the only floats whose shape fits; None if there are none."""
-    return usual_position(arrays) or _only_positions(arrays)
-
-
-def usual_position(arrays: Arrays) -> str | None:
-    """Name of the positions where it is a usual one; None else."""
-    by_plain_name = _by_plain_name(arrays)
-    names = [by_plain_name[usual] for usual in USUAL_NAMES["position"] if usual in by_plain_name]
-    return next((name for name in names if can_be_positions(arrays[name])), None)
-
-
-def _only_positions(arrays: Arrays) -> str | None:
     taken = {usual for names in USUAL_NAMES.values() for usual in names}
     fitting = [
         name
         for name, array in arrays.items()
         if array.dtype.kind == "f" and can_be_positions(array) and plain_name(name) not in taken
     ]
-    return fitting[0] if len(fitting) == 1 else None
+    return usual_position(arrays) or (fitting[0] if len(fitting) == 1 else None)
 
 
-def _by_plain_name(arrays: Arrays) -> dict[str, str]:
-    return {plain_name(name): name for name in reversed(list(arrays))}
+def usual_position(arrays: Arrays) -> str | None:
+    """Name of the positions where it is a usual one; None else."""
+    return next((name for name in with_meaning("position", arrays) if can_be_positions(arrays[name])), None)
 
 
 def find_roles(arrays: Arrays, position: str) -> dict[str, str]:
-    """Name of the array of each other meaning; its shape must fit."""
+    """Name of the array of each meaning; its shape must fit."""
     *runs, frames, particles, dim = arrays[position].shape
     at_particles = [(particles,), (frames, particles)]
     shapes: dict[str, list[tuple[int, ...]]] = {
@@ -144,39 +196,32 @@ def find_roles(arrays: Arrays, position: str) -> dict[str, str]:
         "bounds": [(dim, 2), (2, dim)],
         "particle_volume": [(), (1,)],
     }
-    by_plain_name = {plain: name for plain, name in _by_plain_name(arrays).items() if name != position}
-    roles = {}
-    for meaning, allowed in shapes.items():
-        fitting = [*allowed, *((*runs, *shape) for shape in allowed if runs)]
-        names = [by_plain_name[usual] for usual in USUAL_NAMES[meaning] if usual in by_plain_name]
-        match = next((name for name in names if tuple(arrays[name].shape) in fitting), None)
-        if match is not None:
-            roles[meaning] = match
-    for meaning, kinds in _LISTS.items():
-        names = [by_plain_name[usual] for usual in USUAL_NAMES[meaning] if usual in by_plain_name]
-        lists = [name for name in names if arrays[name].dtype.kind in kinds and len(arrays[name].shape) == 1]
-        if lists:
-            roles[meaning] = lists[0]
+
+    def fits(meaning: str, array: ArrayLike) -> bool:
+        shape = tuple(array.shape)
+        if meaning in _LISTS:
+            return len(shape) == 1 and array.dtype.kind in _LISTS[meaning]
+        return shape in shapes[meaning] or any(shape == (*runs, *one) for one in shapes[meaning])
+
+    others = [name for name in arrays if name != position]
+    roles = {"position": position}
+    for meaning in (*shapes, *_LISTS):
+        fitting = [name for name in with_meaning(meaning, others) if fits(meaning, arrays[name])]
+        roles |= {meaning: fitting[0]} if fitting else {}
     return roles
 
 
 _LISTS = {"type_names": "SUO", "static_types": "iu", "boundary": "SUO"}
 """Kinds of the numbers or texts of facts that are lists of any length."""
 
-_AXIS_NAMES: Mapping[str, tuple[str, ...]] = {
-    "position": (r"{axis}", r"pos{axis}", r"position{axis}", r"p{axis}"),
-    "velocity": (r"v{axis}", r"vel{axis}", r"velocity{axis}"),
-}
-
 
 def join_components(arrays: Arrays) -> Arrays:
     """The arrays, with x, y (and z) of equal shape (T, N) or (R, T, N) as `position`, likewise vx, vy as `velocity`."""
-    joined, by_plain_name = dict(arrays), _by_plain_name(arrays)
-    for meaning, patterns in _AXIS_NAMES.items():
-        for pattern in patterns:
-            names = [by_plain_name.get(pattern.format(axis=axis)) for axis in "xyz"]
-            present = [name for name in names[: names.index(None) if None in names else 3] if name is not None]
-            shapes = {tuple(arrays[name].shape) for name in present}
-            if len(present) > 1 and meaning not in joined and len(shapes) == 1 and len(next(iter(shapes))) in (2, 3):
-                joined[meaning] = Components([joined.pop(name) for name in present])
+    joined = dict(arrays)
+    fitting = [name for name, array in arrays.items() if len(array.shape) in (2, 3)]
+    plain = by_plain_name(name for name in fitting if not name[-1].isdigit())  # numbers tell runs apart
+    for meaning in COMPONENTS:
+        names = component_names(plain, meaning)
+        if meaning not in joined and len({tuple(arrays[name].shape) for name in names}) == 1:
+            joined[meaning] = Components([joined.pop(name) for name in names])
     return joined

@@ -7,12 +7,11 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
 from nmpm.data.convert.array_files import ArrayFiles, open_arrays
-from nmpm.data.convert.named_arrays import USUAL_NAMES, Arrays, can_be_positions, describe, plain_name
+from nmpm.data.convert.named_arrays import Arrays, can_be_positions, describe, with_meaning
 from nmpm.data.convert.tables import SUFFIXES
 from nmpm.data.convert.tracks import table_columns
 from nmpm.errors import NmpmError
@@ -20,35 +19,29 @@ from nmpm.errors import NmpmError
 _PAGE = "docs/howto/your_data.md shows all forms."
 _MOST = 1000  # files that are looked at
 _WRITE = 'nmpm.write_trajectories("mydata", runs, dt=…)'
-_MOLECULES = "MDAnalysis, ase or OVITO write it as .xyz or as a LAMMPS dump, which are read"
-_MESHES = "Houdini or Blender write it as a .ply file per frame, which are read"
 
-HINTS = MappingProxyType(
-    {
-        ".mat": f"read it by scipy.io.loadmat (or h5py) and write positions (T, N, D) by {_WRITE}",
-        ".pt": f"read it by torch.load(…, weights_only=True) and write positions (T, N, D) by {_WRITE}",
-        ".pth": f"read it by torch.load(…, weights_only=True) and write positions (T, N, D) by {_WRITE}",
-        ".pkl": f"pickles of this content are not opened, as they can run code: load it yourself, then {_WRITE}",
-        ".pickle": f"pickles are not opened, as they can run code: load it yourself, then {_WRITE}",
-        ".nc": f"read it by xarray.open_dataset and write positions (T, N, D) by {_WRITE}",
-        ".zarr": f"read it by zarr.open and write positions (T, N, D) by {_WRITE}",
-        ".xlsx": "save it as .csv: a row for each particle in each frame, with frame, id, x, y",
-        ".feather": "write it as .parquet: a row for each particle in each frame, with frame, id, x, y",
-        ".xtc": _MOLECULES,
-        ".trr": _MOLECULES,
-        ".dcd": _MOLECULES,
-        ".gsd": _MOLECULES,
-        ".pdb": _MOLECULES,
-        ".bgeo": _MESHES,
-        ".sc": _MESHES,
-        ".abc": _MESHES,
-        ".usd": _MESHES,
-        ".usda": _MESHES,
-        ".usdc": _MESHES,
-        ".obj": _MESHES,
-        ".tfrecord": "DeepMind's datasets need their metadata.json beside them",
-    }
-)
+HINTS: Mapping[str, str] = {
+    suffix: hint
+    for suffixes, hint in (
+        (".mat", f"read it by scipy.io.loadmat (or h5py) and write positions (T, N, D) by {_WRITE}"),
+        (".pt .pth", f"read it by torch.load(…, weights_only=True) and write positions (T, N, D) by {_WRITE}"),
+        (
+            ".pkl .pickle",
+            f"pickles of this content are not opened, as they can run code: load it yourself, then {_WRITE}",
+        ),
+        (".nc", f"read it by xarray.open_dataset and write positions (T, N, D) by {_WRITE}"),
+        (".zarr", f"read it by zarr.open and write positions (T, N, D) by {_WRITE}"),
+        (".xlsx", "save it as .csv: a row for each particle in each frame, with frame, id, x, y"),
+        (".feather", "write it as .parquet: a row for each particle in each frame, with frame, id, x, y"),
+        (".xtc .trr .dcd .gsd .pdb", "MDAnalysis, ase or OVITO write it as .xyz or as a LAMMPS dump, which are read"),
+        (
+            ".bgeo .sc .abc .usd .usda .usdc .obj",
+            "Houdini or Blender write it as a .ply file per frame, which are read",
+        ),
+        (".tfrecord", "DeepMind's datasets need their metadata.json beside them"),
+    )
+    for suffix in suffixes.split()
+}
 """How to get from files of a suffix to a form that is read."""
 
 
@@ -92,8 +85,8 @@ def _array_problem(file: Path) -> str:
 
 def _wrong_positions(arrays: Arrays) -> str | None:
     """What is wrong with the shape of the array that is called positions, or else of the largest one."""
-    leaves: Mapping[str, str] = {plain_name(name.rpartition("/")[2]): name for name in reversed(list(arrays))}
-    named = [leaves[usual] for usual in USUAL_NAMES["position"] if usual in leaves]
+    leaves = {name.rpartition("/")[2]: name for name in reversed(list(arrays))}
+    named = [leaves[leaf] for leaf in with_meaning("position", leaves)]
     numbers = [name for name, array in arrays.items() if array.dtype.kind in "fiuO"]
     largest = sorted(numbers, key=lambda name: -int(np.prod(arrays[name].shape)))
     for name in (named or largest)[:1]:

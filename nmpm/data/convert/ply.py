@@ -11,8 +11,9 @@ import numpy as np
 
 from nmpm._support.bounded_files import check_regular
 from nmpm._support.messages import one_line
-from nmpm.data.convert.frame import AXES, Frame
+from nmpm.data.convert.frame import Frame
 from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.data.convert.named_arrays import AXES
 from nmpm.errors import ConfigError, DataError
 
 _TIME = re.compile(r"time\W+([-+.\deE]+)\s*$", re.IGNORECASE)

@@ -18,13 +18,15 @@ from nmpm.data.convert.named_arrays import (
     as_text,
     can_be_positions,
     describe,
+    drop_axes,
     find_roles,
     join_components,
     position_name,
+    type_ids,
     usual_position,
 )
-from nmpm.data.convert.run_files import cut
-from nmpm.data.format import Trajectory
+from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, FLAT, Facts, cut, placeholder_metadata
+from nmpm.data.format import Metadata, Trajectory
 from nmpm.errors import DataError
 from nmpm.scene import Boundary, Interval
 
@@ -53,49 +55,40 @@ class RunArrays:
         if name is None:
             raise DataError(f"{self.where}: none of the arrays can be positions ({describe(arrays)}).")
         object.__setattr__(self, "arrays", arrays)
-        object.__setattr__(self, "roles", {"position": name, **find_roles(arrays, name)})
+        object.__setattr__(self, "roles", find_roles(arrays, name))
 
     @property
     def stacked(self) -> bool:
         """Whether positions are (R, T, N, D)."""
-        return len(self._position.shape) == 4
+        return len(self._shape) == 4
 
     @property
     def count(self) -> int:
         """Number of runs."""
-        return self._position.shape[0] if self.stacked else 1
+        return self._shape[0] if self.stacked else 1
 
     @property
     def frames(self) -> int:
         """Number of frames of each run."""
-        return self._position.shape[-3]
+        return self._shape[-3]
 
     @property
-    def _position(self) -> ArrayLike:
-        return self.arrays[self.roles["position"]]
+    def _shape(self) -> tuple[int, ...]:
+        return self.arrays[self.roles["position"]].shape
 
     @cached_property
     def field_names(self) -> tuple[str, ...]:
         """Names of the further arrays that fit frames or particles."""
-        others = [name for name in self.arrays if name not in self.roles.values()]
-        return tuple(name for name in others if self._is_field(self.arrays[name]))
-
-    @cached_property
-    def left_out(self) -> tuple[str, ...]:
-        """Names and shapes of arrays that fit neither frames nor particles."""
-        rest = {
-            name: array
+        return tuple(
+            name
             for name, array in self.arrays.items()
-            if name not in self.roles.values() and name not in self.field_names
-        }
-        return tuple(f"{name} {array.dtype} {array.shape}" for name, array in rest.items())
-
-    def _is_field(self, array: ArrayLike) -> bool:
-        return array.dtype.kind in "biuf" and (self._fits(array.shape) or self._per_run(array))
+            if name not in self.roles.values()
+            and array.dtype.kind in "biuf"
+            and (self._fits(array.shape) or self._per_run(array))
+        )
 
     def _fits(self, shape: Sequence[int]) -> bool:
-        frames, particles = self._position.shape[-3:-1]
-        return not shape or shape[0] == particles or shape[0] == frames
+        return not shape or shape[0] in self._shape[-3:-1]
 
     def _per_run(self, array: ArrayLike) -> bool:
         """Whether the first axis of an array counts the runs."""
@@ -108,105 +101,97 @@ class RunArrays:
         array = self.arrays[name]
         return np.asarray(array[run] if self._per_run(array) else array[()])
 
-    def positions(self, run: int) -> np.ndarray:
-        """The (T, N, D) positions of a run as they are stored."""
-        return np.asarray(self._position[run] if self.stacked else self._position[()])
-
-    def fact(self, meaning: str, run: int = 0) -> np.ndarray | None:
+    def _fact(self, meaning: str, run: int = 0) -> np.ndarray | None:
         """The array of a meaning in a run; None where there is none."""
         name = self.roles.get(meaning)
         return None if name is None else self._take(name, run)
 
-    def stated_facts(self, dim: int) -> dict[str, Any]:
+    def facts(self) -> Facts:
+        """Metadata from the arrays, names of those that are unknown, and notes on how arrays are read."""
+        position = self._take(self.roles["position"], 0)
+        flat = position.shape[2] == 3 and not np.nan_to_num(position[..., 2]).any()
+        dim = position.shape[2] - flat
+        stated = self._stated(dim)
+        unknown = EVERYTHING_UNKNOWN - {*stated, *({"gravity"} & set(self.roles))}
+        taken = {*self.roles.values(), *self.field_names}
+        rest = {name: array for name, array in self.arrays.items() if name not in taken}
+        shapes = (f"{meaning} {name!r} {tuple(self.arrays[name].shape)}" for meaning, name in self.roles.items())
+        fields = f"; fields {', '.join(self.field_names)}" if self.field_names else ""
+        left_out = f" Left out, as they fit neither: {describe(rest, len(rest))}." if rest else ""
+        notes = (f"Arrays: {', '.join(shapes)}{fields}.{left_out}", *((FLAT,) if flat else ()))
+        return placeholder_metadata(dim, **stated), unknown, notes
+
+    def _stated(self, dim: int) -> dict[str, Any]:
         """Fields of `Metadata` that arrays state, for data of so many axes."""
-        facts: dict[str, Any] = {"particle_types": self.type_names(), "bounds": (self.bounds() or ())[:dim]}
+        facts: dict[str, Any] = {"particle_types": self._type_names(), "bounds": self._bounds()[:dim]}
         for name in ("dt", "particle_volume"):
-            value = self.fact(name)
+            value = self._fact(name)
             if value is not None and np.isfinite(value).all() and (value > 0).all():
                 facts[name] = float(value.reshape(-1)[0])
-        boundary, static = self.fact("boundary"), self.fact("static_types")
+        boundary, static = self._fact("boundary"), self._fact("static_types")
         if boundary is not None and set(as_text(boundary)) <= set(get_args(Boundary)):
             facts["boundary"] = tuple(as_text(boundary).tolist()[:dim])
         if static is not None and facts["particle_types"]:
             facts["static_types"] = frozenset(static.tolist())
         return {name: value for name, value in facts.items() if value or name == "static_types"}
 
-    def type_names(self) -> dict[int, str]:
+    def _type_names(self) -> dict[int, str]:
         """Names of type ids, where types are stored as names or names beside them; else empty."""
-        types, names = self.roles.get("types"), self.fact("type_names")
+        types, names = self.roles.get("types"), self._fact("type_names")
         if types is not None and self.arrays[types].dtype.kind in "SUO":
             return dict(enumerate(sorted(set(as_text(self.arrays[types][()]).flat))))
         return {} if names is None else {i: name for i, name in enumerate(as_text(names).tolist()) if name}
 
-    def notes(self) -> tuple[str, ...]:
-        """Sentences on what the arrays are taken for."""
-        shapes = ", ".join(
-            f"{meaning} {name!r} {tuple(self.arrays[name].shape)}" for meaning, name in self.roles.items()
-        )
-        fields = f"; fields {', '.join(self.field_names)}" if self.field_names else ""
-        left_out = f" Left out, as they fit neither: {', '.join(self.left_out)}." if self.left_out else ""
-        return (f"Arrays: {shapes}{fields}.{left_out}",)
-
-    def bounds(self) -> tuple[Interval, ...] | None:
-        """(lower, upper) per axis, from (D, 2) or (2, D) numbers; None where there are none that fit."""
-        values, dim = self.fact("bounds"), self._position.shape[-1]
+    def _bounds(self) -> tuple[Interval, ...]:
+        """(lower, upper) per axis, from (D, 2) or (2, D) numbers; () where there are none that fit."""
+        values, dim = self._fact("bounds"), self._shape[-1]
         if values is None or values.shape not in ((dim, 2), (2, dim)):
-            return None
+            return ()
         low, high = (values if values.shape == (2, dim) and dim != 2 else values.T).astype(np.float64)
         fits = np.isfinite([low, high]).all() and (low < high).all()
-        return tuple(zip(low.tolist(), high.tolist(), strict=True)) if fits else None
+        return tuple(zip(low.tolist(), high.tolist(), strict=True)) if fits else ()
 
-    def read(self, run: int, dim: int, ids: Mapping[str, int]) -> Trajectory:
-        """The trajectory of a run.
-
-        Args:
-            run: Its index.
-            dim: Axes to keep; those after them are 0 everywhere.
-            ids: Type ids by name, where types are stored as names.
+    def read(self, run: int, metadata: Metadata) -> Trajectory:
+        """The trajectory of a run, with the axes and type ids of the metadata.
 
         Raises:
             DataError: if arrays do not fit together, naming the file and run.
         """
         where = f"{self.where}, run {run}" if self.stacked else self.where
-        position = self.positions(run).astype(np.float32)  # a copy, in which absent particles become NaN
-        types = self._types(run, position.shape[:2], ids, where)
+        position = self._take(self.roles["position"], run).astype(np.float32)  # a copy, where absent becomes NaN
+        types = self._types(run, position.shape[:2], metadata, where)
         check_axes(position, None if types is None else types.shape[-1], where)
-        position = _drop_axes(position, dim, where)
-        fixed = np.zeros(position.shape[1], np.int64)
-        if types is not None:
-            fixed = _constant_types(types, position, where)
+        position = drop_axes(position, metadata.dim, where)
+        fixed = np.zeros(position.shape[1], np.int64) if types is None else _constant_types(types, position, where)
         self._mark_absent(run, position, where)
+        gravity = self._fact("gravity", run)
+        stated = gravity is not None and gravity.ndim == 1 and len(gravity) >= metadata.dim
+        attributes = {"gravity": gravity[: metadata.dim].astype(np.float64)} if gravity is not None and stated else {}
         try:
-            trajectory = Trajectory(position, fixed, self._attributes(run, dim), self._fields(run, dim))
+            trajectory = Trajectory(position, fixed, attributes, self._fields(run, metadata.dim))
         except DataError as error:
             raise DataError(f"{where}: {error}") from error
         return cut(trajectory, range(len(position)))
 
-    def _types(self, run: int, sizes: tuple[int, ...], ids: Mapping[str, int], where: str) -> np.ndarray | None:
+    def _types(self, run: int, sizes: tuple[int, ...], metadata: Metadata, where: str) -> np.ndarray | None:
         """(N,) or (T, N) type ids."""
-        values = self.fact("types", run)
+        values = self._fact("types", run)
         if values is None:
             return None
+        name = self.roles["types"]
         values = np.broadcast_to(values, sizes[1:]) if values.ndim == 0 else values
         if values.shape not in (sizes, sizes[1:], sizes[:1]):
             raise DataError(
-                f"{where}: {self.roles['types']} {values.shape} fits neither {sizes[1]} particles nor {sizes[0]} frames"
-                " of them."
+                f"{where}: {name} {values.shape} fits neither {sizes[1]} particles nor {sizes[0]} frames of them."
             )
-        if values.dtype.kind in "biuf":
-            if values.dtype.kind == "f" and not (values == np.round(values)).all():
-                raise DataError(f"{where}: {self.roles['types']} must be whole numbers.")
-            return values.astype(np.int64)
-        unknown = sorted(set(np.unique(as_text(values)).tolist()) - set(ids))
-        if unknown:
-            raise DataError(
-                f"{where}: the type {unknown[0]!r} does not occur in the first run; give it an id: --types"
-                f" {len(ids)}={unknown[0]}."
-            )
-        return np.array([ids[name] for name in as_text(values).flat]).reshape(values.shape)
+        if values.dtype.kind not in "biuf":
+            return type_ids(as_text(values), {name: i for i, name in metadata.particle_types.items()}, where)
+        if values.dtype.kind == "f" and not (values == np.round(values)).all():
+            raise DataError(f"{where}: {name} must be whole numbers.")
+        return values.astype(np.int64)
 
     def _mark_absent(self, run: int, position: np.ndarray, where: str) -> None:
-        active = self.fact("active", run)
+        active = self._fact("active", run)
         if active is None:
             return
         name = self.roles["active"]
@@ -216,15 +201,9 @@ class RunArrays:
             raise DataError(f"{where}: {name} {active.shape} must be (T, N) = {position.shape[:2]}, or (N,).")
         position[~np.broadcast_to(active.astype(bool), position.shape[:2])] = np.nan
 
-    def _attributes(self, run: int, dim: int) -> dict[str, Any]:
-        gravity = self.fact("gravity", run)
-        if gravity is None or gravity.ndim != 1 or len(gravity) < dim:
-            return {}
-        return {"gravity": gravity[:dim].astype(np.float64)}
-
     def _fields(self, run: int, dim: int) -> dict[str, np.ndarray]:
         fields = {name.replace("/", "_"): self._take(name, run) for name in self.field_names}
-        velocity, time = self.fact("velocity", run), self.fact("time", run)
+        velocity, time = self._fact("velocity", run), self._fact("time", run)
         if velocity is not None:
             fields["velocity"] = velocity[..., :dim].astype(np.float32)
         if time is not None:
@@ -234,13 +213,11 @@ class RunArrays:
 
 def _constant_types(types: np.ndarray, position: np.ndarray, where: str) -> np.ndarray:
     """(N,) types; positions become NaN where the type is -1."""
-    if types.ndim == 1:
-        position[:, types == -1] = np.nan
-        return types
     absent = types == -1
-    position[absent] = np.nan
-    first = (~absent).argmax(axis=0)
-    fixed: np.ndarray = np.take_along_axis(types, first[None], axis=0)[0]
+    position[absent if types.ndim == 2 else (slice(None), absent)] = np.nan
+    if types.ndim == 1:
+        return types
+    fixed: np.ndarray = np.take_along_axis(types, absent.argmin(axis=0)[None], axis=0)[0]
     changes = (types != fixed) & ~absent
     if changes.any():
         frame, particle = map(int, np.argwhere(changes)[0])
@@ -249,14 +226,6 @@ def _constant_types(types: np.ndarray, position: np.ndarray, where: str) -> np.n
             " must be constant in time, but for -1 where a particle is absent."
         )
     return fixed
-
-
-def _drop_axes(position: np.ndarray, dim: int, where: str) -> np.ndarray:
-    if position.shape[2] < dim:
-        raise DataError(f"{where}: positions have {position.shape[2]} axes, those of the first run have {dim}.")
-    if position[..., dim:].any():
-        raise DataError(f"{where}: z is 0 in the first run, but not here. Give all runs the same number of axes.")
-    return position[..., :dim]
 
 
 _RUN_WORDS = frozenset(

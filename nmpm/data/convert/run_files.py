@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,11 @@ LEAST_FRAMES = 16
 EVERYTHING_UNKNOWN = frozenset(
     {"bounds", "dt", "gravity", "static_types", "boundary", "particle_volume", "sequence_length", "particle_types"}
 )
+
+FLAT = "z is 0 everywhere: the data are 2-D."
+
+Facts = tuple[Metadata, frozenset[str], tuple[str, ...]]
+"""Metadata, names of its fields that are unknown, and notes for the user."""
 
 
 def placeholder_metadata(dim: int, **facts: Any) -> Metadata:
@@ -48,6 +53,10 @@ class Run:
     frames: int = 0
     split: str | None = None
     part: range | None = None
+
+    def take(self, trajectory: Trajectory) -> Trajectory:
+        """The part of its whole trajectory."""
+        return trajectory if self.part is None else cut(trajectory, self.part)
 
 
 _CUT = "Cut along time: the first 80% of the frames train, then 10% valid, 10% test."
@@ -79,8 +88,8 @@ class RunFiles(DatasetFormat):
         """Number of frames of a run."""
 
     @abc.abstractmethod
-    def facts(self, file: Path) -> tuple[Metadata, frozenset[str], tuple[str, ...]]:
-        """Metadata from the first file, names of those that are unknown, and notes for the user."""
+    def facts(self, file: Path) -> Facts:
+        """What the first file states."""
 
     @abc.abstractmethod
     def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:
@@ -95,38 +104,42 @@ class RunFiles(DatasetFormat):
         if not files:
             raise DataError(f"{path}: no file {' or '.join(self.patterns)} there.")
         runs = {split: [run for file in paths for run in self.runs(file)] for split, paths in files.items()}
-        undivided = runs.pop("all", [])
-        if undivided and len(undivided) < 3:  # they may be cut along time
-            undivided = [replace(run, frames=self.frames(run)) for run in undivided]
-        splits, divided = divide(undivided) if undivided else (runs, ())
-        stated, unknown, notes = self.facts(next(iter(files.values()))[0])
-        stated, unknown = apply_family(stated, unknown, options)
-        metadata = options.apply_to(stated)
-        dataset = ForeignDataset(
-            metadata,
-            {split: partial(self._read_all, parts, metadata) for split, parts in splits.items()},
-            (*notes, *divided),
-            {split: len(parts) for split, parts in splits.items()},
-            unknown=unknown,
-        )
-        return keep_whole(dataset, undivided, partial(self._read_all, metadata=metadata)) if undivided else dataset
+        if len(runs.get("all", ())) in (1, 2):  # they may be cut along time
+            runs["all"] = [replace(run, frames=self.frames(run)) for run in runs["all"]]
+        facts = self.facts(next(iter(files.values()))[0])
+        return open_divided(runs, facts, self._read_all, options)
 
     def _read_all(self, runs: Sequence[Run], metadata: Metadata) -> Iterator[Trajectory]:
         for file in dict.fromkeys(run.file for run in runs):
             inside = [run for run in runs if run.file == file]
             trajectories = self.read(file, [run.index for run in inside], metadata)
             for run, trajectory in zip(inside, trajectories, strict=True):
-                yield trajectory if run.part is None else cut(trajectory, run.part)
+                yield run.take(trajectory)
 
 
-def apply_family(metadata: Metadata, unknown: frozenset[str], options: Options) -> tuple[Metadata, frozenset[str]]:
-    """The metadata with the types of the family that the user names, and the names of fields that are still unknown."""
-    if options.family is None:
-        return metadata, unknown
-    family = find_family(options.family)
-    names, static, prescribed = dict(family.types), family.static, family.prescribed
-    stated = replace(metadata, particle_types=names, static_types=static, prescribed_types=prescribed)
-    return stated, unknown - {"particle_types", "static_types"}
+def open_divided(
+    runs: Mapping[str, Sequence[SomeRun]],
+    facts: Facts,
+    read: Callable[[Sequence[SomeRun], Metadata], Iterator[Trajectory]],
+    options: Options,
+) -> ForeignDataset:
+    """The dataset of runs by split, of which those of the split "all" are divided by `divide`."""
+    metadata, unknown, notes = facts
+    if options.family is not None:
+        family = find_family(options.family)
+        names, static, prescribed = dict(family.types), family.static, family.prescribed
+        metadata = replace(metadata, particle_types=names, static_types=static, prescribed_types=prescribed)
+        unknown -= {"particle_types", "static_types"}
+    metadata, undivided = options.apply_to(metadata), runs.get("all")
+    splits, divided = divide(undivided) if undivided else (runs, ())
+
+    def dataset(splits: Mapping[str, Sequence[SomeRun]], notes: tuple[str, ...]) -> ForeignDataset:
+        readers = {split: partial(read, each, metadata) for split, each in splits.items()}
+        counts = {split: len(each) for split, each in splits.items()}
+        return ForeignDataset(metadata, readers, notes, counts, unknown=unknown - options.stated)
+
+    whole = dataset({"train": undivided}, notes) if undivided and divided == (_CUT,) else None
+    return replace(dataset(splits, (*notes, *divided)), whole=whole)
 
 
 def divide(runs: Sequence[SomeRun]) -> tuple[dict[str, Sequence[SomeRun]], tuple[str, ...]]:
@@ -142,29 +155,8 @@ def divide(runs: Sequence[SomeRun]) -> tuple[dict[str, Sequence[SomeRun]], tuple
         note = f"Nothing divides the {len(runs)} runs: in their order {sizes}. Folders train, valid, test would."
         return {split: [runs[index] for index in part] for split, part in parts.items()}, (note,)
     if all(run.frames >= 10 * LEAST_FRAMES for run in runs):
-        return {split: [replace(run, part=time_parts(run.frames)[split]) for run in runs] for split in SPLITS}, (_CUT,)
+        return {split: [replace(run, part=split_runs(run.frames)[split]) for run in runs] for split in SPLITS}, (_CUT,)
     return {"train": runs}, (f"{counted(len(runs), 'run')}, too few to divide: all for training.",)
-
-
-def keep_whole(
-    dataset: ForeignDataset, runs: Sequence[SomeRun], read: Callable[[Sequence[SomeRun]], Iterator[Trajectory]]
-) -> ForeignDataset:
-    """The dataset, with its runs `whole` beside it if `divide` has cut them along time; `read` reads runs."""
-    if _CUT not in dataset.notes:
-        return dataset
-    notes = tuple(note for note in dataset.notes if note != _CUT)
-    whole = replace(dataset, splits={"train": partial(read, runs)}, counts={"train": len(runs)}, notes=notes)
-    return replace(dataset, whole=whole)
-
-
-def time_parts(frames: int) -> dict[str, range]:
-    """The frames of a long run by split."""
-    tenth = frames // 10
-    return {
-        "train": range(frames - 2 * tenth),
-        "valid": range(frames - 2 * tenth, frames - tenth),
-        "test": range(frames - tenth, frames),
-    }
 
 
 def cut(trajectory: Trajectory, part: range) -> Trajectory:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from nmpm.data.convert.array_files import array_facts
 from nmpm.data.convert.base import ForeignDataset, Options
 from nmpm.data.convert.run_arrays import RunArrays, group_runs
-from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, cut, divide, placeholder_metadata
+from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Facts, Run, open_divided, placeholder_metadata
 from nmpm.data.format import SPLITS, Metadata, Trajectory
 from nmpm.errors import DataError
 
@@ -28,13 +26,16 @@ class _MemoryRun(Run):
 
     source: RunArrays | Trajectory = field(kw_only=True)
 
+    def facts(self) -> Facts:
+        if isinstance(self.source, RunArrays):
+            return self.source.facts()
+        if self.source.metadata is not None:
+            return self.source.metadata, frozenset(), ()
+        return placeholder_metadata(self.source.position.shape[2]), EVERYTHING_UNKNOWN, ()
+
     def read(self, metadata: Metadata) -> Trajectory:
-        if isinstance(self.source, Trajectory):
-            trajectory = self.source
-        else:
-            ids = {name: i for i, name in metadata.particle_types.items()}
-            trajectory = self.source.read(self.index, metadata.dim, ids)
-        return trajectory if self.part is None else cut(trajectory, self.part)
+        source = self.source
+        return self.take(source if isinstance(source, Trajectory) else source.read(self.index, metadata))
 
 
 def open_runs(runs: Runs | Mapping[str, Runs], options: Options) -> ForeignDataset:
@@ -44,37 +45,17 @@ def open_runs(runs: Runs | Mapping[str, Runs], options: Options) -> ForeignDatas
         DataError: if there are none, or arrays do not fit together; names the run.
         ConfigError: if an option is invalid.
     """
-    notes: tuple[str, ...] = ()
-    if isinstance(runs, Mapping) and set(runs) <= set(SPLITS):
-        splits: Mapping[str, Sequence[_MemoryRun]] = {
-            name: list(_each(part, f"{name} ")) for name, part in runs.items()
-        }
-    else:
-        splits, notes = divide(list(_each(runs, "")))
-    first = next((part[0].source for part in splits.values() if part), None)
+    divided = isinstance(runs, Mapping) and set(runs) <= set(SPLITS)
+    parts: Mapping[str, Any] = runs if isinstance(runs, Mapping) and divided else {"all": runs}
+    splits = {name: list(_each(part, f"{name} " if divided else "")) for name, part in parts.items()}
+    first = next((part[0] for part in splits.values() if part), None)
     if first is None:
         raise DataError("There are no runs to write.")
-    stated, unknown, arrays = _facts(first)
-    metadata = options.apply_to(stated)
-    return ForeignDataset(
-        metadata,
-        {name: partial(_read, part, metadata) for name, part in splits.items()},
-        (*arrays, *notes),
-        {name: len(part) for name, part in splits.items()},
-        unknown=unknown - options.stated,
-    )
+    return open_divided(splits, first.facts(), _read, options)
 
 
 def _read(runs: Sequence[_MemoryRun], metadata: Metadata) -> Iterator[Trajectory]:
     return (run.read(metadata) for run in runs)
-
-
-def _facts(first: RunArrays | Trajectory) -> tuple[Metadata, frozenset[str], tuple[str, ...]]:
-    if isinstance(first, RunArrays):
-        return array_facts(first)
-    if first.metadata is not None:
-        return first.metadata, frozenset(), ()
-    return placeholder_metadata(first.position.shape[2]), EVERYTHING_UNKNOWN, ()
 
 
 def _each(runs: Runs | Mapping[str, Any], where: str) -> Iterator[_MemoryRun]:
@@ -84,10 +65,11 @@ def _each(runs: Runs | Mapping[str, Any], where: str) -> Iterator[_MemoryRun]:
         if isinstance(item, Trajectory):
             yield _MemoryRun(Path(name), 0, len(item.position), source=item)
             continue
-        arrays = item if isinstance(item, Mapping) else {"position": item}
-        groups = list(group_runs({key: np.asarray(array) for key, array in arrays.items()}, name))
+        named = item if isinstance(item, Mapping) else {"position": item}
+        arrays = {key: np.asarray(array) for key, array in named.items()}
+        groups = list(group_runs(arrays, name))
         if not groups:
-            shapes = ", ".join(f"{key} {np.shape(array)}" for key, array in arrays.items())
+            shapes = ", ".join(f"{key} {array.shape}" for key, array in arrays.items())
             raise DataError(f"{name}: none of the arrays is (T, N, D) or (R, T, N, D) positions ({shapes}).")
         for group in groups:
             yield from (_MemoryRun(Path(name), index, group.frames, source=group) for index in range(group.count))

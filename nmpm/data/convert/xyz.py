@@ -15,8 +15,9 @@ from typing import ClassVar
 import numpy as np
 
 from nmpm._support.messages import one_line
-from nmpm.data.convert.frame import AXES, Frame, wrap
+from nmpm.data.convert.frame import Frame, wrap
 from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.data.convert.named_arrays import AXES
 from nmpm.data.convert.text_lines import Lines, open_lines, parse_columns
 from nmpm.errors import DataError
 from nmpm.scene import Boundary, Interval
