@@ -31,7 +31,7 @@ examples:
   nmpm init grains --gravity 0,-9.81            what you know better than the data show
   nmpm fit --data.path grains                   all at once, into runs/grains
 
-What a configuration cannot state, such as names of types and the time step, goes into a copy of the data:
+Names of types and the time step are no part of a configuration; they go into a copy of the data:
   nmpm convert grains NEW --types 1=steel,2=glass --dt 0.004
   nmpm init NEW
 """

@@ -26,6 +26,7 @@ _WIDTH = 100
 _GRIDS_ASIDE = 2  # of the recommended one, on either side
 _MOST_FINDINGS = 7
 _NOTE_LINES = 10
+_PLAIN_TO_SEE = {"sequence_length", "particle_types", "prescribed_types"}
 _TITLES = {"contradiction": "contradictions: models of these data will be wrong", "oddity": "odd: look at it"}
 _EXAMPLES = """\
 examples:
@@ -138,7 +139,7 @@ def _dataset_of(path: Path) -> Path:
 
 def _lines(inspection: Inspection, costs: Mapping[int, GridCost]) -> Iterator[str]:
     """The lines of the summary, at most 100 characters wide."""
-    yield f"{inspection.path}: {inspection.dim}-D, {inspection.dt:g} s between frames"
+    yield f"{inspection.path}: {inspection.dim}-D, {_time_step(inspection)}"
     yield from _finding_lines(inspection)
     for name, split in inspection.splits.items():
         trajectories = "trajectory" if split.trajectories == 1 else "trajectories"
@@ -165,7 +166,8 @@ def _lines(inspection: Inspection, costs: Mapping[int, GridCost]) -> Iterator[st
     if inspection.rest is not None:
         middle, first, last = inspection.rest
         moving = f"; {inspection.restless} still move at their end" if inspection.restless else ""
-        rows["at rest"] = f"from frame {middle} on ({first}-{last}), {middle * inspection.dt:.3g} s{moving}"
+        time = "" if _guessed(inspection, "dt") else f", time {middle * inspection.dt:.3g}"
+        rows["at rest"] = f"from frame {middle} on ({first}-{last}){time}{moving}"
     for label, text in rows.items():
         for number, line in enumerate(text.splitlines()):
             start = f"  {'' if number else label:<10}"
@@ -174,12 +176,23 @@ def _lines(inspection: Inspection, costs: Mapping[int, GridCost]) -> Iterator[st
     yield from _note_lines(inspection)
 
 
+def _time_step(inspection: Inspection) -> str:
+    if _guessed(inspection, "dt"):
+        return "no times recorded: a frame is the unit of time"
+    return f"frames {inspection.dt:g} apart in time"
+
+
+def _guessed(inspection: Inspection, name: str) -> bool:
+    return inspection.found.get(name, "").startswith("guessed")
+
+
 def _note_lines(inspection: Inspection) -> Iterator[str]:
     """Notes, in which facts that were found in the trajectories are one."""
-    levels: dict[str, list[str]] = {}
+    levels: dict[str, list[str]] = {"measured": [], "likely": [], "guessed": []}
     for name, how in inspection.found.items():
-        levels.setdefault(how.partition(":")[0], []).append(name)
-    sure = "; ".join(f"{level} {', '.join(names)}" for level, names in levels.items())
+        if name not in _PLAIN_TO_SEE:
+            levels[how.partition(":")[0]].append(name)
+    sure = "; ".join(f"{level} {', '.join(names)}" for level, names in levels.items() if names)
     notes = [f"Found in the trajectories: {sure} (--json says how)."] if sure else []
     notes += [note for note in inspection.notes if note.partition(" ")[0] not in inspection.found]
     merged = [note for note in _merged(inspection) if note.severity == "note"]

@@ -36,7 +36,7 @@ _EXAMPLES = """\
 examples:
   nmpm rollout goop --frames 400 --out out.h5            a zoo model, from thrown blocks
   nmpm rollout runs/goop --data test.h5 --trajectory 3   a run's best, from a recorded start
-  nmpm rollout runs/grains --data grains.npz             or from any file or folder that can be trained on
+  nmpm rollout runs/grains --data grains.npz             or from any other form of data
   nmpm rollout runs/goop/checkpoints/last.ckpt
   nmpm rollout goop --out splash.usda                    for Blender; .vtkhdf for ParaView, .csv, …
   nmpm rollout goop --device cuda --runtime auto         on a GPU, by CUDA graphs

@@ -141,7 +141,7 @@ class _Log:
         facts = self._finder.facts()
         self.metadata = facts.complete(self.metadata, self.unknown)
         self._facts = [
-            f"{name} {_short(getattr(self.metadata, name))} ({how.rstrip('.')})."
+            f"{name} {_short(name, getattr(self.metadata, name))} ({how.rstrip('.')})."
             for name, how in self.metadata.extra[FOUND].items()
             if getattr(self.metadata, name) != frozenset() and name != "sequence_length"
         ]
@@ -175,20 +175,24 @@ class _Log:
                 " recorded (--prescribed)."
             )
         notes += self._facts
-        if self.metadata.sequence_length != UNKNOWN_LENGTH:
+        if self.metadata.sequence_length != UNKNOWN_LENGTH and "sequence_length" not in self.unknown:
             return replace(self.metadata, extra=extra), notes + notes_on_lengths(self.frames, self.metadata)
         return replace(self.metadata, extra=extra, sequence_length=max(self.frames) - 1), notes
 
 
-def _short(value: Any) -> str:
+def _short(name: str, value: Any) -> str:
     """A value of the metadata as text, its numbers with four digits."""
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {name}" for key, name in value.items())
+        return ", ".join(f"{key} {text}" for key, text in value.items())
+    if name == "boundary" and len(set(value)) == 1:
+        return str(value[0])
+    if name in ("bounds", "domain"):
+        return ", ".join(f"{axis} {low:.4g}…{high:.4g}" for axis, (low, high) in zip("xyz", value, strict=False))
     if isinstance(value, frozenset | tuple):
-        return "(" + ", ".join(map(_short, value)) + ")" if value else "none"
-    return "unknown" if value is None else str(value)
+        return ", ".join(_short("", each) for each in value)
+    return "is not known" if value is None else str(value)
 
 
 def renumber_types(source: ForeignDataset, ids: Mapping[int, int]) -> ForeignDataset:

@@ -144,15 +144,15 @@ class Axis:
     def sentence(self) -> str:
         """How its bounds were found."""
         if self.period:
-            return f"{self.name}: the period {self.period.length:.6g}, found from {self.period.jumps} jumps"
+            return f"the period {self.period.length:.6g}, found from {self.period.jumps} jumps"
         if self.opens:
-            return f"{self.name}: the extent of all positions"
+            return "the extent of all positions"
         met = [f"{wall.coordinate:.5g} ({wall.touched} of {wall.trajectories} trajectories)" for wall in self._walls]
         parts = [f"particles stop or turn at {' and '.join(met)}"] if met else []
         if len(met) < 2:
             where = "" if not met else " above" if self.lower else " below"
             parts.append(f"no wall was met{where}, so the extreme position and up to {_MARGIN:.0%}")
-        return f"{self.name}: {', '.join(parts)}"
+        return ", ".join(parts)
 
     @property
     def _walls(self) -> list[Wall]:
@@ -197,7 +197,10 @@ def find_axes(
 
 def bounds_fact(axes: Sequence[Axis], spacing: float) -> Fact[tuple[Interval, ...]]:
     """Where particles may be."""
-    how = "; ".join(axis.sentence() for axis in axes) + "."
+    names: dict[str, list[str]] = {}
+    for axis in axes:
+        names.setdefault(axis.sentence(), []).append(axis.name)
+    how = "; ".join(f"{', '.join(same)}: {sentence}" for sentence, same in names.items()) + "."
     bounds = tuple(axis.bounds(spacing) for axis in axes)
     if all(axis.certain for axis in axes):
         return Fact(bounds, how, "measured")

@@ -32,7 +32,7 @@ def find_particle_volume(samples: Iterable[Sample], materials: frozenset[int]) -
     if not nearest:
         return Fact(None, "no two particles are there in a first frame.", "guessed")
     if not dense:
-        return Fact(nearest, "(median distance to the nearest neighbour in first frames) ** dim.", "likely")
+        return Fact(nearest, "as on a lattice, by the distance of nearest neighbours in first frames.", "likely")
     if dense_late and dense > _SETTLED * dense_late:
         how = (
             f"particles are {dense / dense_late:.1f} times denser in last frames than in first ones, where each has a"
@@ -43,10 +43,13 @@ def find_particle_volume(samples: Iterable[Sample], materials: frozenset[int]) -
 
 
 def _choose(nearest: float, dense: float, how: str) -> Fact[float | None]:
-    spacing = f"(distance to the nearest neighbour) ** dim = {nearest:.4g}"
     if abs(nearest / dense - 1) < _LATTICE:
-        return Fact(nearest, f"{how} {spacing}; particles per volume give {dense:.4g}.", "measured")
-    return Fact(dense, f"{how} particles per volume; {spacing} is not a lattice's.", "likely")
+        return Fact(
+            nearest, f"{how} the distance of nearest neighbours; particles per volume give {dense:.4g}.", "measured"
+        )
+    return Fact(
+        dense, f"{how} particles per volume; nearest neighbours on a lattice would give {nearest:.4g}.", "likely"
+    )
 
 
 def _medians(estimate: Callable[[np.ndarray], float], clouds: Sequence[np.ndarray]) -> float:

@@ -139,8 +139,9 @@ def inspect(source: FolderSource, trajectories: int | None = None) -> Inspection
         differences = find_disagreements(statistics.result(), metadata.extra)
         findings += [Finding("statistics", Severity.ODDITY, sentence) for sentence in differences]
     stated = [metadata.extra.get(f"sequence_length_{name}") for name in splits]
-    lengths = notes_on_lengths(counts.frames, metadata, [length for length in stated if isinstance(length, int)])
-    findings += [Finding("sequence length", Severity.NOTE, sentence) for sentence in lengths]
+    if "sequence_length" not in metadata.extra.get(FOUND, {}):
+        lengths = notes_on_lengths(counts.frames, metadata, [length for length in stated if isinstance(length, int)])
+        findings += [Finding("sequence length", Severity.NOTE, sentence) for sentence in lengths]
     occupied, occupied_each = measured.occupied()
     fall = np.median(measured.falls or [np.zeros(metadata.dim)], axis=0) / metadata.dt**2
     rests = [rest for rest in measured.rests if rest is not None]

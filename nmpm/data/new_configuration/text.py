@@ -155,7 +155,7 @@ def _remarks(source: CompletedSource, choice: Choice) -> Iterator[str]:
 def _gravity(scene: Scene) -> str:
     if scene.gravity_varies:
         return "of each trajectory's own"
-    return "not known" if scene.gravity is None else str([float(f"{g:.6g}") for g in scene.gravity])
+    return "not known" if scene.gravity is None else ", ".join(f"{g:.6g}" for g in scene.gravity)
 
 
 def _box(box: Sequence[tuple[float, float]]) -> str:
