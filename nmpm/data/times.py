@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from nmpm.data.format import Trajectory
 from nmpm.errors import DataError
 
 _TOLERANCE = 0.02  # of a step
@@ -33,6 +34,15 @@ def usual_step(time: np.ndarray) -> float:
     """The mean step of (T,) times where the steps are even, so that rounding does not count, else the median."""
     steps = np.diff(np.asarray(time, dtype=np.float64))
     return float(np.median(steps) if uneven_step(time) else steps.mean())
+
+
+def recorded_step(trajectory: Trajectory) -> float | None:
+    """The usual step of a trajectory's recorded times; None where none are recorded, or they do not grow."""
+    time = np.asarray(trajectory.fields.get("time", ()), dtype=np.float64)
+    if time.shape != (len(trajectory.position),) or len(time) < 2 or not np.isfinite(time).all():
+        return None
+    step = usual_step(time)
+    return step if step > 0 else None
 
 
 def _rounding(time: np.ndarray, step: float) -> float:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
-from nmpm.data.facts.fact import Fact
+from nmpm.data.facts.fact import Fact, Sure
 from nmpm.data.facts.open_ends import Openings, Period, find_openings, find_period
 from nmpm.data.grid_rule import LEAST_CELLS, MULTIPLE, PER_AXIS
 from nmpm.scene import Boundary, Interval
@@ -38,6 +39,9 @@ class Wall:
     touched: int  # trajectories
     trajectories: int
 
+    def __str__(self) -> str:
+        return f"{self.coordinate:.5g} ({self.touched} of {self.trajectories} trajectories)"
+
     @property
     def certain(self) -> bool:
         """Whether it was touched in several trajectories, so that no single event explains it."""
@@ -49,11 +53,9 @@ def find_wall(positions: Sequence[np.ndarray], axis: int, upper: bool, spacing: 
     share = _SHARE if len(positions) > 1 else _SINGLE_SHARE
     outermost_of_each = (_touch(each, axis, upper, spacing, share) for each in positions)
     touches = [touch for touch in outermost_of_each if touch is not None]
-    if not touches:
-        return None
-    outermost = min(touches)
+    outermost = min(touches, default=math.inf)
     count = sum(touch < outermost + _ALIKE * spacing for touch in touches)
-    if count < min(2, len(positions)):
+    if not touches or count < min(2, len(positions)):
         return None
     return Wall(-outermost if upper else outermost, count, len(positions))
 
@@ -115,11 +117,11 @@ class Axis:
         return "periodic" if self.period else "open" if self.opens else "wall"
 
     @property
-    def certain(self) -> bool:
-        """Whether both ends were seen."""
-        return bool(
-            self.period or self.opens or (self.lower and self.lower.certain and self.upper and self.upper.certain)
-        )
+    def sure(self) -> Sure:
+        """How sure its ends are."""
+        if self.period or self.opens or (self.lower and self.lower.certain and self.upper and self.upper.certain):
+            return "measured"
+        return "likely" if self.lower and self.upper else "guessed"
 
     def bounds(self, spacing: float) -> Interval:
         """(lower, upper): the period, the extent of positions at open ends and walls, or more where none was met."""
@@ -147,16 +149,12 @@ class Axis:
             return f"the period {self.period.length:.6g}, found from {self.period.jumps} jumps"
         if self.opens:
             return "the extent of all positions"
-        met = [f"{wall.coordinate:.5g} ({wall.touched} of {wall.trajectories} trajectories)" for wall in self._walls]
+        met = [str(wall) for wall in (self.lower, self.upper) if wall]
         parts = [f"particles stop or turn at {' and '.join(met)}"] if met else []
         if len(met) < 2:
             where = "" if not met else " above" if self.lower else " below"
             parts.append(f"no wall was met{where}, so the extreme position and up to {_MARGIN:.0%}")
         return ", ".join(parts)
-
-    @property
-    def _walls(self) -> list[Wall]:
-        return [wall for wall in (self.lower, self.upper) if wall is not None]
 
 
 def _round(steps: int, unit: float) -> float:
@@ -166,13 +164,9 @@ def _round(steps: int, unit: float) -> float:
 def find_axes(
     positions: Sequence[np.ndarray], extent: Ends, solid: Ends | None, spacing: float
 ) -> tuple[tuple[Axis, ...], Openings]:
-    """The axes, and where tracks end.
+    """The axes, and where tracks end, by positions (F, N, D) of moving particles in some trajectories.
 
-    Args:
-        positions: Of moving particles in some trajectories, (F, N, D) each.
-        extent: Of all moving particles.
-        solid: Extent of all other particles; None where there are none.
-        spacing: Typical distance of neighbours.
+    The extents are of all moving particles, and of all others (`solid`, if any); `spacing` is that of neighbours.
     """
     openings = find_openings(positions, *extent)
     axes = []
@@ -202,20 +196,17 @@ def bounds_fact(axes: Sequence[Axis], spacing: float) -> Fact[tuple[Interval, ..
         names.setdefault(axis.sentence(), []).append(axis.name)
     how = "; ".join(f"{', '.join(same)}: {sentence}" for sentence, same in names.items()) + "."
     bounds = tuple(axis.bounds(spacing) for axis in axes)
-    if all(axis.certain for axis in axes):
-        return Fact(bounds, how, "measured")
-    ends = [axis.period or axis.opens or (axis.lower and axis.upper) for axis in axes]
-    return Fact(bounds, how, "likely" if all(ends) else "guessed")
+    return Fact(bounds, how, max((axis.sure for axis in axes), key=get_args(Sure).index))
 
 
 def boundary_fact(axes: Sequence[Axis], openings: Openings) -> Fact[tuple[Boundary, ...]]:
     """The kind of boundary of each axis."""
     parts = [f"{axis.name}: particles wrap" for axis in axes if axis.period]
-    names = ", ".join(axis.name for axis in axes if axis.opens)
-    if names and openings.anywhere:
-        parts.append(f"{names}: {openings.ends} tracks end and {openings.starts} begin on the way, anywhere")
-    elif names:
-        parts.append(f"{names}: {openings.ends} tracks end near its ends, {openings.starts} begin on the way")
+    if names := ", ".join(axis.name for axis in axes if axis.opens):
+        ends, starts = openings.ends, openings.starts
+        anywhere = f"tracks end and {starts} begin on the way, anywhere"
+        near = f"tracks end near its ends, {starts} begin on the way"
+        parts.append(f"{names}: {ends} {anywhere if openings.anywhere else near}")
     if walls := [axis.name for axis in axes if axis.boundary == "wall" and (axis.lower or axis.upper)]:
         parts.append(f"{', '.join(walls)}: particles stop or turn at walls")
     if rest := [axis.name for axis in axes if axis.boundary == "wall" and not (axis.lower or axis.upper)]:

@@ -10,7 +10,7 @@ import numpy as np
 from nmpm.data.facts.boundaries import Axis, Ends, boundary_fact, bounds_fact, domain_fact, find_axes
 from nmpm.data.facts.fact import Fact, Facts
 from nmpm.data.facts.free_fall import Track, find_gravity
-from nmpm.data.facts.obstacles import TypeMotion, name_types, prescribed_fact
+from nmpm.data.facts.obstacles import TypeMotion, prescribed_fact
 from nmpm.data.facts.open_ends import Openings, unwrap
 from nmpm.data.facts.sample import Samples
 from nmpm.data.facts.timing import TimeSteps
@@ -49,7 +49,7 @@ class FactFinder:
         """Adds a trajectory."""
         position, types = trajectory.position, trajectory.particle_type
         self._frames.add(len(position))
-        self._times.add(trajectory.fields.get("time"))
+        self._times.add(trajectory)
         low, high = np.fmin.reduce(position, axis=0), np.fmax.reduce(position, axis=0)
         present = np.isfinite(low).all(axis=1)
         if not present.any():
@@ -58,8 +58,7 @@ class FactFinder:
             extent = self._extents.setdefault(kind, Extent(self.dim))
             extent.add(np.stack([low, high])[:, types == kind])
         reach = (high - low).max(axis=1).astype(np.float64)
-        seen_once = np.isfinite(position[..., 0]).sum(axis=0) < 2
-        reach[seen_once] = np.nan
+        reach[np.isfinite(position[..., 0]).sum(axis=0) < 2] = np.nan
         self._motion.add(types, present, reach, mean_spacing(low[present], high[present]))
         self._samples.add(trajectory)
 
@@ -84,7 +83,7 @@ class FactFinder:
             boundary=boundary,
             dt=dt,
             gravity=self._gravity(axes, materials, spacing, self._dt or dt.value),
-            particle_types=self._names(static.value, prescribed.value),
+            particle_types=self._motion.names_fact(prescribed.value),
             static_types=static,
             prescribed_types=prescribed,
             particle_volume=volume,
@@ -119,20 +118,10 @@ class FactFinder:
         self, axes: tuple[Axis, ...], materials: frozenset[int], spacing: float, dt: float
     ) -> Fact[tuple[float, ...] | None]:
         periods = np.array([axis.period.length if axis.period else 0.0 for axis in axes])
-        tracks = [
-            Track(unwrap(sample.of(materials), periods), sample.times(dt))
-            for sample in self._samples
-            if np.isin(sample.types, list(materials)).any()
-        ]
+        positions = [(sample, sample.of(materials)) for sample in self._samples]
+        tracks = [Track(unwrap(each, periods), sample.times(dt)) for sample, each in positions if each.shape[1]]
         closed = bool((periods > 0).all()) and materials == frozenset(self._extents)
         return find_gravity(tracks, spacing, dt, closed)
-
-    def _names(self, static: frozenset[int], prescribed: frozenset[int]) -> Fact[dict[int, str]]:
-        names = name_types(self._extents, static, prescribed)
-        count = self._motion.count
-        rare = [f"{kind} in {number}" for kind, number in self._motion.types.items() if number < count]
-        how = f"by their ids{f'; of {count} trajectories type ' if rare else ''}{', '.join(rare)}."
-        return Fact(names, how, "guessed")
 
     def _length(self) -> Fact[int]:
         few, many = min(self._frames), max(self._frames)
@@ -157,8 +146,8 @@ def find_facts(split: Split, metadata: Metadata | None = None) -> Facts:
     Raises:
         DataError: if a trajectory cannot be read, or no particle is ever there.
     """
-    known = (metadata.dt, metadata.obstacle_types) if metadata else (None, frozenset[int]())
-    finder = FactFinder(split.dim, *known)
+    stated = (metadata.dt, metadata.obstacle_types) if metadata else (None, frozenset[int]())
+    finder = FactFinder(split.dim, *stated)
     for index in split.sample(_SAMPLE_BYTES):
         finder.add(split.read_with_fields(index))
     return finder.facts()

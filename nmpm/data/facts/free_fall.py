@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from nmpm.data.facts.fact import Fact, Sure
+from nmpm.data.gravity import Gravity
 
-AGREE = 0.1
-"""Of an acceleration: others that differ by less agree with it."""
+_AGREE = 0.1  # of an acceleration: others that differ by less agree with it
 _CANDIDATES = 400  # particles
 _STILL = 0.02  # of the spacing: particles that move less over a parabola are at rest
 _STRAIGHT = 0.01  # of the velocity: its change over a straight flight, at most
@@ -60,9 +60,8 @@ class Flight:
     @property
     def straight(self) -> bool:
         """Whether the velocity changes by less than 1%."""
-        return float(np.linalg.norm(self.acceleration)) * self.duration**2 < _STRAIGHT * float(
-            np.linalg.norm(self.travelled)
-        )
+        change = float(np.linalg.norm(self.acceleration)) * self.duration**2
+        return change < _STRAIGHT * float(np.linalg.norm(self.travelled))
 
 
 def fit_parabolas(position: np.ndarray, time: np.ndarray) -> Parabolas:
@@ -85,12 +84,9 @@ def fit_parabolas(position: np.ndarray, time: np.ndarray) -> Parabolas:
 
 def join(parts: Sequence[Parabolas]) -> Parabolas:
     """Parabolas of equal duration as one set."""
-    return Parabolas(
-        np.concatenate([part.velocity for part in parts]),
-        np.concatenate([part.acceleration for part in parts]),
-        np.concatenate([part.error for part in parts]),
-        parts[0].duration,
-    )
+    columns = zip(*((part.velocity, part.acceleration, part.error) for part in parts), strict=True)
+    velocity, acceleration, error = map(np.concatenate, columns)
+    return Parabolas(velocity, acceleration, error, parts[0].duration)
 
 
 def shared_acceleration(parabolas: Parabolas, spacing: float) -> Flight | None:
@@ -101,12 +97,9 @@ def shared_acceleration(parabolas: Parabolas, spacing: float) -> Flight | None:
     moving = parabolas.select(speed * span + size * span**2 > _STILL * spacing)
     if len(moving.error) < 2:
         return None
-    some = np.random.default_rng(0).permutation(len(moving.error))[:_CANDIDATES]
-    candidates = moving.select(some)
-    reach = np.maximum(
-        AGREE * np.linalg.norm(candidates.acceleration, axis=1),
-        _STRAIGHT * np.linalg.norm(candidates.velocity, axis=1) / span,
-    )
+    candidates = moving.select(np.random.default_rng(0).permutation(len(moving.error))[:_CANDIDATES])
+    speed, size = (np.linalg.norm(vectors, axis=1) for vectors in (candidates.velocity, candidates.acceleration))
+    reach = np.maximum(_AGREE * size, _STRAIGHT * speed / span)
     distance = np.linalg.norm(candidates.acceleration[:, None] - candidates.acceleration[None], axis=2)
     near = (distance < reach[:, None]) & (candidates.error[None] < reach[:, None])
     # Of candidates with equally many neighbours, the one that is closest to them.
@@ -137,20 +130,16 @@ class Track:
 
     def flight(self, start: int, frames: int, spacing: float) -> Flight | None:
         """The acceleration that particles share over some frames."""
-        stop = start + frames
-        if len(self.position) < stop:
-            return None
-        return shared_acceleration(fit_parabolas(self.position[start:stop], self.time[start:stop]), spacing)
+        window = slice(start, start + frames)
+        fits = len(self.position) >= window.stop
+        return shared_acceleration(fit_parabolas(self.position[window], self.time[window]), spacing) if fits else None
 
 
-def find_gravity(tracks: Sequence[Track], spacing: float, dt: float, closed: bool) -> Fact[tuple[float, ...] | None]:
+def find_gravity(tracks: Sequence[Track], spacing: float, dt: float, closed: bool) -> Fact[Gravity | None]:
     """Gravity in length per time², or None where trajectories do not show it.
 
-    Args:
-        tracks: Of some trajectories.
-        spacing: Typical distance of neighbours.
-        dt: Time between frames.
-        closed: Whether all axes are periodic and there are no obstacles, so that only gravity changes momentum.
+    `spacing` is the typical distance of neighbours, `dt` the time between frames. In a `closed` space all axes are
+    periodic and there are no obstacles, so that only gravity changes momentum.
     """
     number = len(tracks)
     flights = [flight for flight in (_first_flight(track, spacing) for track in tracks) if flight is not None]
@@ -158,7 +147,7 @@ def find_gravity(tracks: Sequence[Track], spacing: float, dt: float, closed: boo
     straight = [flight for flight in free if flight.straight]
     if straight and 2 * len(straight) >= len(free):
         return _no_gravity(straight, number, spacing, dt)
-    if alike := _agreeing([flight.acceleration for flight in free], AGREE):
+    if alike := _agreeing([flight.acceleration for flight in free], _AGREE):
         return _from_flights([free[index] for index in alike], number, dt)
     clear = [flight for flight in free if flight.share > _CLEAR]
     if len(clear) >= 2 and 2 * len(clear) >= number:
@@ -168,7 +157,7 @@ def find_gravity(tracks: Sequence[Track], spacing: float, dt: float, closed: boo
         how = f"mean acceleration of all particles in first frames of {len(means)} of {number} trajectories"
         return _gravity(means, dt, how, "likely")
     later = [flight for flight in (_later_flight(track, spacing) for track in tracks) if flight is not None]
-    alike = _agreeing([flight.acceleration for flight in later], AGREE)
+    alike = _agreeing([flight.acceleration for flight in later], _AGREE)
     if len(alike) >= 2:
         how = f"particles in flight at any time in {len(alike)} of {number} trajectories"
         return _gravity([later[index].acceleration for index in alike], dt, how, "likely")
@@ -185,7 +174,7 @@ def _first_flight(track: Track, spacing: float) -> Flight | None:
         half = _LONG // 2
         halves = [track.flight(start, half, spacing) for start in (0, half)]
         longer = track.flight(0, _LONG, spacing)
-        if longer and all(part and _same(part.acceleration, longer.acceleration, 2 * AGREE) for part in halves):
+        if longer and all(part and _same(part.acceleration, longer.acceleration, 2 * _AGREE) for part in halves):
             return longer
     return best
 
@@ -201,10 +190,9 @@ def _later_flight(track: Track, spacing: float) -> Flight | None:
         return None
     starts = np.unique(np.linspace(0, final, _LATER).astype(int))
     windows = [slice(start, start + _LATER_FRAMES) for start in starts.tolist()]
-    fits = [fit_parabolas(track.position[window], track.time[window]) for window in windows]
-    every = join(fits)
+    every = join([fit_parabolas(track.position[window], track.time[window]) for window in windows])
     size = np.linalg.norm(every.acceleration, axis=1)
-    flight = shared_acceleration(every.select(every.error < AGREE / 2 * size), spacing)
+    flight = shared_acceleration(every.select(every.error < _AGREE / 2 * size), spacing)
     return flight if flight is not None and not flight.straight and flight.share > _LATER_SHARE else None
 
 
@@ -217,29 +205,30 @@ def _agreeing(vectors: Sequence[np.ndarray], tolerance: float) -> list[int]:
     return np.flatnonzero(agree).tolist() if agree.mean() > _MOST else []
 
 
-def _from_flights(flights: Sequence[Flight], number: int, dt: float) -> Fact[tuple[float, ...] | None]:
+def _from_flights(flights: Sequence[Flight], number: int, dt: float) -> Fact[Gravity | None]:
     vectors = [flight.acceleration for flight in flights]
     share = float(np.median([flight.share for flight in flights]))
-    means = sum(_same(flight.mean, flight.acceleration, AGREE) for flight in flights)
-    how = f"free flight of {share:.0%} of the particles in first frames of {len(flights)} of {number} trajectories"
-    how = f"{how}, the mean acceleration of all in {means}"
+    means = sum(_same(flight.mean, flight.acceleration, _AGREE) for flight in flights)
+    how = (
+        f"free flight of {share:.0%} of the particles in first frames of {len(flights)} of {number} trajectories, the"
+        f" mean acceleration of all in {means}"
+    )
     clear = means or (share > _CLEAR and len(flights) > 1)
     return _gravity(vectors, dt, how if clear else f"{how}: others collide", "measured" if clear else "likely")
 
 
-def _gravity(vectors: Sequence[np.ndarray], dt: float, how: str, sure: Sure) -> Fact[tuple[float, ...] | None]:
+def _gravity(vectors: Sequence[np.ndarray], dt: float, how: str, sure: Sure) -> Fact[Gravity | None]:
     """Their median, rounded, in length per time²."""
     centre = np.median(vectors, axis=0)
     size = float(np.linalg.norm(centre))
     spread = max(float(np.linalg.norm(vector - centre)) for vector in vectors) / size
     digits = -math.floor(math.log10(max(spread / math.sqrt(len(vectors)), _ROUNDED) * size / dt**2))
-    value = tuple(
-        round(float(part) / dt**2, digits) + 0.0 if abs(part) > max(_EXACT, spread) * size else 0.0 for part in centre
-    )
+    parts = np.where(np.abs(centre) > max(_EXACT, spread) * size, centre / dt**2, 0.0).tolist()
+    value = tuple(round(part, digits) + 0.0 for part in parts)
     return Fact(value, f"{how}; they agree to {max(spread, 1e-3):.1%}.", sure)
 
 
-def _no_gravity(flights: Sequence[Flight], number: int, spacing: float, dt: float) -> Fact[tuple[float, ...] | None]:
+def _no_gravity(flights: Sequence[Flight], number: int, spacing: float, dt: float) -> Fact[Gravity | None]:
     """No gravity, where straight flights go along all axes."""
     travelled = np.max([flight.travelled for flight in flights], axis=0)
     count = f"in {len(flights)} of {number} trajectories"
@@ -251,13 +240,14 @@ def _no_gravity(flights: Sequence[Flight], number: int, spacing: float, dt: floa
     return Fact((0.0,) * len(travelled), how, "measured" if len(flights) > 1 else "likely")
 
 
-def _differing(flights: Sequence[Flight], number: int, dt: float) -> Fact[tuple[float, ...] | None]:
-    few = "; ".join(_text(flight.acceleration / dt**2) for flight in flights[:3])
+def _differing(flights: Sequence[Flight], number: int, dt: float) -> Fact[Gravity | None]:
+    accelerations = [", ".join(f"{part / dt**2:.3g}" for part in flight.acceleration) for flight in flights[:3]]
+    few = "; ".join(f"({values})" for values in accelerations)
     how = f"it differs: free flight in {len(flights)} of {number} trajectories shows {few} …"
     return Fact(None, f"{how}; state it in each trajectory's attribute `gravity`.", "measured")
 
 
-def _from_momentum(tracks: Sequence[Track], dt: float) -> Fact[tuple[float, ...] | None] | None:
+def _from_momentum(tracks: Sequence[Track], dt: float) -> Fact[Gravity | None] | None:
     """Gravity from the mean acceleration of all particles; None where it is not steady."""
     second = [np.diff(track.position, 2, axis=0) for track in tracks]
     complete = [each[np.isfinite(each).all(axis=2)] for each in second]
@@ -284,7 +274,3 @@ def _why_not(tracks: Sequence[Track], flights: Sequence[Flight], spacing: float)
     if not flights:
         return "paths in first frames are no parabolas: they are noisy, or particles push each other"
     return "too few particles share an acceleration in first frames: they push each other, or touch walls"
-
-
-def _text(vector: np.ndarray) -> str:
-    return "(" + ", ".join(f"{value:.3g}" for value in vector) + ")"

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from nmpm.data.facts.fact import Fact, Unmoving
 
-_STILL = 1e-3  # of the spacing: particles that move less never move
+_STILL = 1e-3  # of the spacing: particles of a type that move less are static
+_UNMOVED = 1e-5  # of the spacing: among others of their type, particles that move less never move
 _MOVES = 0.5  # of the spacing: half of the particles move more where a trajectory moves
 _RIGID = 1e-2  # of the spacing, by which particles of a rigid body may be off
 _SAME = 0.1  # of the spacing, by which motions of one program may differ
@@ -21,31 +23,25 @@ class TypeMotion:
     """Accumulates how far the particles of each type move."""
 
     def __init__(self) -> None:
-        self.types: dict[int, int] = {}  # trajectories in which each type occurs
+        self._types: dict[int, int] = {}  # trajectories in which each type occurs
         self._range: dict[int, float] = {}  # in mean spacings
         self._unmoving: dict[int, list[Unmoving]] = {}
-        self.count = 0
+        self._count = 0
 
     def add(self, types: np.ndarray, present: np.ndarray, reach: np.ndarray, spacing: float) -> None:
-        """Adds a trajectory.
+        """Adds a trajectory of N particles at a mean distance.
 
-        Args:
-            types: (N,) type ids.
-            present: (N,) whether a particle is ever there.
-            reach: (N,) extent of each particle's path, NaN where it is there in less than two frames.
-            spacing: Mean distance of particles.
+        By particle: its type, whether it is ever there, and the extent of its path, NaN if it is there only once.
         """
-        paths_of_movers = reach[reach > _STILL * spacing]
-        moving = len(paths_of_movers) > 0 and float(np.median(paths_of_movers)) > _MOVES * spacing
+        still = never_moving(reach, spacing)
         for kind in np.unique(types[present]).tolist():
-            of_kind = np.flatnonzero(types == kind)
-            paths = reach[of_kind]
-            self.types[kind] = self.types.get(kind, 0) + 1
-            self._range[kind] = max(self._range.get(kind, 0.0), float(np.fmax.reduce(paths, initial=0.0)) / spacing)
-            still = of_kind[paths < _STILL * spacing]
-            if moving and len(still) and len(self._unmoving.setdefault(kind, [])) < _MOST:
-                self._unmoving[kind].append(Unmoving(self.count, int(still[0]), len(still)))
-        self.count += 1
+            farthest = float(np.fmax.reduce(reach[types == kind], initial=0.0)) / spacing
+            self._types[kind] = self._types.get(kind, 0) + 1
+            self._range[kind] = max(self._range.get(kind, 0.0), farthest)
+            indices, entries = np.flatnonzero(still & (types == kind)), self._unmoving.setdefault(kind, [])
+            if len(indices) and len(entries) < _MOST:
+                entries.append(Unmoving(self._count, int(indices[0]), len(indices)))
+        self._count += 1
 
     @property
     def static(self) -> frozenset[int]:
@@ -66,6 +62,24 @@ class TypeMotion:
         least = min(self._range[kind] for kind in self._range if kind not in static)
         how = f"the particles of type {names} never move, those of other types move by {least:.3g} spacings or more."
         return Fact(static, how, "measured")
+
+    def names_fact(self, prescribed: frozenset[int]) -> Fact[dict[int, str]]:
+        """Names of types: `boundary`, `moving boundary`, `particles`; with the id where several would have the name."""
+        kinds = {i: "moving boundary" if i in prescribed else "" for i in sorted(self._types)}
+        kinds |= dict.fromkeys(sorted(self.static), "boundary")
+        counts = Counter(kinds.values())
+        numbered = {i: f"{kind} {i}" if kind else f"type{i}" for i, kind in kinds.items()}
+        names = {i: kind or "particles" if counts[kind] == 1 else numbered[i] for i, kind in kinds.items()}
+        rare = [f"{kind} in {number}" for kind, number in self._types.items() if number < self._count]
+        how = f"by their ids{f'; of {self._count} trajectories type ' if rare else ''}{', '.join(rare)}."
+        return Fact(names, how, "guessed")
+
+
+def never_moving(reach: np.ndarray, spacing: float) -> np.ndarray:
+    """Whether particles never move, by the extents of their paths (N,), while most of those that do go far."""
+    movers = reach[reach > _STILL * spacing]
+    far = len(movers) > 0 and float(np.median(movers)) > _MOVES * spacing
+    return np.asarray((reach < _UNMOVED * spacing) & far)
 
 
 def prescribed_fact(positions: Mapping[int, Sequence[np.ndarray]], spacing: float) -> Fact[frozenset[int]]:
@@ -124,13 +138,3 @@ def _rigid_error(before: np.ndarray, after: np.ndarray) -> float:
     signs = np.ones(len(right))
     signs[-1] = np.sign(np.linalg.det(left @ right))
     return float(np.abs((source @ (left * signs)) @ right - target).max())
-
-
-def name_types(types: Iterable[int], static: frozenset[int], prescribed: frozenset[int]) -> dict[int, str]:
-    """Names of type ids: `boundary`, `moving boundary`, `particles`; with the id where several would have the name."""
-    base = {i: "boundary" if i in static else "moving boundary" if i in prescribed else "" for i in sorted(types)}
-    counts = {name: list(base.values()).count(name) for name in base.values()}
-    return {
-        i: (name or "particles") if counts[name] == 1 else f"{name or 'type'}{' ' if name else ''}{i}"
-        for i, name in base.items()
-    }

@@ -9,7 +9,8 @@ import numpy as np
 from nmpm.data.facts.fact import Fact
 from nmpm.data.facts.open_ends import roundest
 from nmpm.data.facts.sample import Sample
-from nmpm.data.times import uneven_step, usual_step
+from nmpm.data.format import Trajectory
+from nmpm.data.times import recorded_step, uneven_step
 
 _EVEN = 0.01  # of a step
 _ALIKE = 0.02  # of the time step: another differs by more
@@ -24,25 +25,22 @@ class TimeSteps:
         self._usual: list[float] = []
         self._uneven = 0
 
-    def add(self, time: np.ndarray | None) -> None:
-        """Adds the (T,) times of the frames of a trajectory, if it has any."""
-        if time is None or np.ndim(time) != 1 or len(time) < 2 or not np.isfinite(time).all():
-            return
-        step = usual_step(time)
-        if step > 0:
+    def add(self, trajectory: Trajectory) -> None:
+        """Adds a trajectory, whose times may be recorded."""
+        if (step := recorded_step(trajectory)) is not None:
             self._usual.append(step)
-            self._uneven += uneven_step(time) is not None
+            self._uneven += uneven_step(trajectory.fields["time"]) is not None
 
     def fact(self, samples: Sequence[Sample]) -> Fact[float]:
         """The time between frames; 1, so that the frame is the unit of time, where nothing tells it."""
         by_velocity = _step_by_velocities(samples)
         per_frame = by_velocity is not None and abs(by_velocity - 1) < _ALIKE
-        if not self._usual:
-            if by_velocity is not None and not per_frame:
-                return Fact(by_velocity, "displacements over recorded velocities.", "measured")
-            if per_frame:
-                return Fact(1.0, "displacements between frames equal the recorded velocities.", "measured")
+        if not self._usual and by_velocity is None:
             return Fact(1.0, "no times are recorded, so the unit of time is the frame.", "guessed")
+        if not self._usual and per_frame:
+            return Fact(1.0, "displacements between frames equal the recorded velocities.", "measured")
+        if not self._usual and by_velocity is not None:
+            return Fact(by_velocity, "displacements over recorded velocities.", "measured")
         step = float(np.median(self._usual))
         step = roundest(step * (1 - 1e-6), step * (1 + 1e-6))
         if by_velocity is not None and not per_frame and abs(by_velocity / step - 1) > _ALIKE:

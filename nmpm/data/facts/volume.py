@@ -33,23 +33,18 @@ def find_particle_volume(samples: Iterable[Sample], materials: frozenset[int]) -
         return Fact(None, "no two particles are there in a first frame.", "guessed")
     if not dense:
         return Fact(nearest, "as on a lattice, by the distance of nearest neighbours in first frames.", "likely")
+    how = "in first frames, by"
     if dense_late and dense > _SETTLED * dense_late:
         how = (
             f"particles are {dense / dense_late:.1f} times denser in last frames than in first ones, where each has a"
             f" volume of {dense:.3g}; this is the volume in last frames, by"
         )
-        return _choose(nearest_late, dense_late, how)
-    return _choose(nearest, dense, "in first frames, by")
-
-
-def _choose(nearest: float, dense: float, how: str) -> Fact[float | None]:
+        nearest, dense = nearest_late, dense_late
     if abs(nearest / dense - 1) < _LATTICE:
-        return Fact(
-            nearest, f"{how} the distance of nearest neighbours; particles per volume give {dense:.4g}.", "measured"
-        )
-    return Fact(
-        dense, f"{how} particles per volume; nearest neighbours on a lattice would give {nearest:.4g}.", "likely"
-    )
+        how = f"{how} the distance of nearest neighbours; particles per volume give {dense:.4g}."
+        return Fact(nearest, how, "measured")
+    how = f"{how} particles per volume; nearest neighbours on a lattice would give {nearest:.4g}."
+    return Fact(dense, how, "likely")
 
 
 def _medians(estimate: Callable[[np.ndarray], float], clouds: Sequence[np.ndarray]) -> float:
