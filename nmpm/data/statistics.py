@@ -75,19 +75,30 @@ def neighbour_distance(split: Split, indices: Sequence[int], metadata: Metadata)
     first frame, it is measured in the frame that has most. It is 0 where it is unknown.
     """
     distances = [np.empty(0)]
-    lower, upper = np.asarray(metadata.bounds).T
-    period = np.where(metadata.periodic, upper - lower, 0.0)  # cKDTree: 0 is not periodic
     for index in indices[:: -(-len(indices) // _SPACING_TRAJECTORIES)]:
         try:
             frame = _fullest_frame(split, index, metadata)
         except DataError:
             continue
-        position = frame.astype(np.float64) - lower
-        if len(position) > 1:
-            wrapped = np.where(metadata.periodic, np.mod(position, np.where(period > 0, period, 1.0)), position)
-            distances.append(cKDTree(wrapped, boxsize=period).query(wrapped, k=2)[0][:, 1])
+        if len(frame) > 1:
+            tree = neighbour_tree(frame, metadata)
+            distances.append(tree.query(tree.data, k=2)[0][:, 1])
     every = np.concatenate(distances)
     return float(np.median(every)) if len(every) else 0.0
+
+
+def relative_positions(position: np.ndarray, metadata: Metadata) -> np.ndarray:
+    """(N, D) float64 positions relative to the bounds, within the period on periodic axes."""
+    lower, upper = np.asarray(metadata.bounds, dtype=np.float64).T
+    wraps, relative = np.asarray(metadata.periodic), position.astype(np.float64) - lower
+    return np.asarray(np.where(wraps, np.mod(relative, np.where(wraps, upper - lower, 1.0)), relative))
+
+
+def neighbour_tree(position: np.ndarray, metadata: Metadata) -> cKDTree:
+    """A search tree of (N, D) positions, relative to the bounds, that wraps on periodic axes."""
+    lower, upper = np.asarray(metadata.bounds, dtype=np.float64).T
+    period = np.where(metadata.periodic, upper - lower, 0.0)  # cKDTree: 0 is not periodic
+    return cKDTree(relative_positions(position, metadata), boxsize=period)
 
 
 def _fullest_frame(split: Split, index: int, metadata: Metadata) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from nmpm.data.facts.boundaries import Axis, Ends, boundary_fact, bounds_fact, domain_fact, find_axes
 from nmpm.data.facts.fact import Fact, Facts
 from nmpm.data.facts.free_fall import Track, find_gravity
-from nmpm.data.facts.obstacles import TypeMotion, prescribed_fact
+from nmpm.data.facts.obstacles import TypeMotion, path_extents, prescribed_fact
 from nmpm.data.facts.open_ends import Openings, unwrap
 from nmpm.data.facts.sample import Samples
 from nmpm.data.facts.timing import TimeSteps
@@ -57,9 +57,7 @@ class FactFinder:
         for kind in np.unique(types[present]).tolist():
             extent = self._extents.setdefault(kind, Extent(self.dim))
             extent.add(np.stack([low, high])[:, types == kind])
-        reach = (high - low).max(axis=1).astype(np.float64)
-        reach[np.isfinite(position[..., 0]).sum(axis=0) < 2] = np.nan
-        self._motion.add(types, present, reach, mean_spacing(low[present], high[present]))
+        self._motion.add(types, present, path_extents(position), mean_spacing(low[present], high[present]))
         self._samples.add(trajectory)
 
     def facts(self) -> Facts:

@@ -75,6 +75,14 @@ class TypeMotion:
         return Fact(names, how, "guessed")
 
 
+def path_extents(position: np.ndarray) -> np.ndarray:
+    """(N,) extents of the paths of particles (T, N, D) along their longest axis; NaN if one is there only once."""
+    low, high = np.fmin.reduce(position, axis=0), np.fmax.reduce(position, axis=0)
+    reach = (high - low).max(axis=1).astype(np.float64)
+    reach[np.isfinite(position[..., 0]).sum(axis=0) < 2] = np.nan
+    return np.asarray(reach)
+
+
 def never_moving(reach: np.ndarray, spacing: float) -> np.ndarray:
     """Whether particles never move, by the extents of their paths (N,), while most of those that do go far."""
     movers = reach[reach > _STILL * spacing]

@@ -7,16 +7,17 @@ from collections import Counter
 
 import numpy as np
 
+from nmpm.data.facts.obstacles import never_moving, path_extents
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.inspection import comparisons
 from nmpm.data.inspection.findings import Finding
-from nmpm.data.inspection.irregular_motion import find_disorder, find_irregular_motion
+from nmpm.data.inspection.irregular_motion import find_disorder, find_irregular_motion, find_noise
 from nmpm.data.inspection.motion import Motion, spacing_of
-from nmpm.data.inspection.noise import find_noise
-from nmpm.data.inspection.particles import find_odd_particles, never_moving
-from nmpm.data.inspection.stated import check_stated, free_fall, recorded_dt
+from nmpm.data.inspection.particles import find_odd_particles
+from nmpm.data.inspection.stated import check_stated, free_fall
 from nmpm.data.statistics import Extent
+from nmpm.data.times import recorded_step
 from nmpm.errors import DataError
 
 WINDOW = 18
@@ -63,7 +64,7 @@ class DatasetChecks:
             return
 
     def _measure(self, motion: Motion) -> None:
-        if (recorded := recorded_dt(motion)) is not None:
+        if (recorded := recorded_step(motion.trajectory)) is not None:
             self._recorded_steps[motion.where] = recorded
         elif (dt := _dt_of_fall(motion)) is not None:
             self._steps_of_fall[motion.where] = dt
@@ -73,7 +74,8 @@ class DatasetChecks:
             self._extents[motion.where], self._stays[motion.where] = motion.extent, motion.stays
         self.spacing = min(self.spacing, motion.spacing or math.inf)
         self._rounding = max(self._rounding, motion.rounding)
-        types, still = motion.trajectory.particle_type[motion.index], never_moving(motion)
+        types = motion.trajectory.particle_type[motion.index]
+        still = never_moving(path_extents(motion.position), motion.spacing)
         self._still.update(types[still].tolist())
         self._moving.update(types[~still].tolist())
         self._crossings += motion.crossings.sum(axis=(1, 2))

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.statistics import displacements, without_those_gone
+from nmpm.data.statistics import displacements, neighbour_tree, without_those_gone
 
 _NEIGHBOURS = 8
 _QUERIES = 2000
@@ -148,20 +148,6 @@ class Motion:
 def lengths(vectors: np.ndarray) -> np.ndarray:
     """(…) lengths of (…, D) vectors."""
     return np.asarray(np.sqrt(np.einsum("...d,...d->...", vectors, vectors)))
-
-
-def relative_positions(position: np.ndarray, metadata: Metadata) -> np.ndarray:
-    """(N, D) float64 positions relative to the bounds, within the period on periodic axes."""
-    lower, upper = np.asarray(metadata.bounds, dtype=np.float64).T
-    wraps, relative = np.asarray(metadata.periodic), position.astype(np.float64) - lower
-    return np.asarray(np.where(wraps, np.mod(relative, np.where(wraps, upper - lower, 1.0)), relative))
-
-
-def neighbour_tree(position: np.ndarray, metadata: Metadata) -> cKDTree:
-    """A search tree of (N, D) positions, relative to the bounds, that wraps on periodic axes."""
-    lower, upper = np.asarray(metadata.bounds, dtype=np.float64).T
-    period = np.where(metadata.periodic, upper - lower, 0.0)  # cKDTree: 0 is not periodic
-    return cKDTree(relative_positions(position, metadata), boxsize=period)
 
 
 def spacing_of(position: np.ndarray, metadata: Metadata) -> float:

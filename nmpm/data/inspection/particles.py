@@ -11,9 +11,6 @@ from nmpm.data.inspection.findings import Finding, Severity
 from nmpm.data.inspection.motion import Motion
 from nmpm.data.statistics import first_moving_particle, first_outside
 
-_STILL = 1e-5  # spacings that particles move which never move
-_MOVES = 1.0  # spacings that others move, at least
-
 
 def find_odd_particles(motion: Motion) -> Iterator[Finding]:
     """Yields findings about the particles of one trajectory."""
@@ -90,13 +87,3 @@ def find_absences(motion: Motion) -> Iterator[Finding]:
         motion.where,
         badness=enter + leave + there.shape[1] * empty,
     )
-
-
-def never_moving(motion: Motion) -> np.ndarray:
-    """(N,) whether a particle stays where it is all the time, while others move; False everywhere if nothing moves."""
-    position = motion.position
-    sides = np.fmax.reduce(position, axis=0) - np.fmin.reduce(position, axis=0)
-    extent = np.maximum.reduce(list(sides.T))
-    if not extent.size or not motion.spacing or not np.nanmax(extent) > _MOVES * motion.spacing:
-        return np.zeros(position.shape[1], dtype=bool)
-    return np.asarray(extent <= _STILL * motion.spacing)

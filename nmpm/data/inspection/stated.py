@@ -12,7 +12,7 @@ from nmpm.data.facts.free_fall import Track, find_gravity
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.inspection.findings import Finding, Severity
 from nmpm.data.inspection.motion import Motion, spacing_of
-from nmpm.data.times import uneven_step, usual_step
+from nmpm.data.times import recorded_step, uneven_step
 
 _FIRST_STEPS = 32  # in which particles are looked for that fly freely
 _LEAST_PARTICLES = 8
@@ -48,18 +48,9 @@ def check_stated(motion: Motion) -> Iterator[Finding]:
     yield from check_volume(motion)
 
 
-def recorded_dt(motion: Motion) -> float | None:
-    """The usual step of the recorded times; None where none are recorded."""
-    time = np.asarray(motion.trajectory.fields.get("time", ()), dtype=np.float64)
-    if time.ndim != 1 or len(time) != len(motion.trajectory.position) or len(time) < 2 or not np.isfinite(time).all():
-        return None
-    dt = usual_step(time)
-    return dt if dt > 0 else None
-
-
 def check_times(motion: Motion) -> Iterator[Finding]:
     """Yields findings about the recorded times of frames: uneven steps, or another one than stated."""
-    dt = recorded_dt(motion)
+    dt = recorded_step(motion.trajectory)
     if dt is None:
         return
     steps = np.diff(np.asarray(motion.trajectory.fields["time"], dtype=np.float64))
@@ -100,7 +91,7 @@ def check_gravity(motion: Motion) -> Iterator[Finding]:
             zero = correction(f"--gravity={_comma(np.zeros(len(fall)))}")
             yield Finding("gravity", Severity.ODDITY, f"{straight} {zero}", motion.where)
         return
-    recorded = recorded_dt(motion)
+    recorded = recorded_step(motion.trajectory)
     dt = recorded or motion.metadata.dt
     measured = np.asarray(fall) / dt**2
     factor = float(np.linalg.norm(stated) / np.linalg.norm(measured))

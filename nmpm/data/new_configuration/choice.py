@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from nmpm.data.facts import FOUND, find_facts
 from nmpm.data.format import Split, find_split, split_paths
 from nmpm.data.grid_rule import GridCost, GridFacts, Machine, TrainingSize, grid_cost, recommended_cells, training_size
-from nmpm.data.inspection.noise import smoothing_frames
+from nmpm.data.inspection.irregular_motion import smoothing_frames
 from nmpm.data.inspection.reading import open_dataset
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.metadata import FAMILIES
