@@ -20,7 +20,7 @@ import numpy as np
 
 from nmpm._support.bounded_files import EXPANSION, NPZ_ERRORS, check_regular, expansion_limit
 from nmpm._support.messages import one_line
-from nmpm.data.convert.base import split_files
+from nmpm.data.convert.base import readable, split_files
 from nmpm.data.convert.named_arrays import USUAL_NAMES, ArrayLike, Arrays, describe, plain_name
 from nmpm.data.convert.run_arrays import group_runs
 from nmpm.data.convert.run_files import Facts, Run, RunFiles
@@ -109,11 +109,9 @@ def open_arrays(path: Path) -> Iterator[Arrays]:
 
 def _open_npy(path: Path) -> np.ndarray:
     check_regular(path)
-    try:
+    with readable(path, "an array of numbers", *NPZ_ERRORS):
         array: np.ndarray = np.load(path, mmap_mode="r", allow_pickle=False)
-        return array
-    except NPZ_ERRORS as error:
-        raise DataError(f"{path}: cannot be read as an array of numbers ({one_line(error)}).") from error
+    return array
 
 
 def _hdf5_arrays(file: Any, path: Path) -> Iterator[tuple[str, ArrayLike]]:
@@ -150,21 +148,12 @@ class NpzArray:
 
     def __init__(self, archive: zipfile.ZipFile, name: str, where: str) -> None:
         self._where = where
-        with self._named_errors():
+        with readable(self._where, "an array", *NPZ_ERRORS):
             self._file: Any = archive.open(f"{name}.npy")
             version = np.lib.format.read_magic(self._file)
             read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
             self.shape, self._fortran, self.dtype = read(self._file)
             self._start = self._file.tell()
-
-    @contextmanager
-    def _named_errors(self) -> Iterator[None]:
-        try:
-            yield
-        except NPZ_ERRORS as error:
-            raise DataError(
-                f"{self._where}: cannot be read ({one_line(error)}). Copy or download the file again."
-            ) from error
 
     def __getitem__(self, rows: int | slice | tuple[()]) -> np.ndarray:
         if self.dtype.hasobject:
@@ -179,13 +168,13 @@ class NpzArray:
 
     def pickled(self) -> bytes:
         """The content of an array of objects."""
-        with self._named_errors():
+        with readable(self._where, "an array", *NPZ_ERRORS):
             self._file.seek(self._start)
             content: bytes = self._file.read()
             return content
 
     def _read(self, first: int, count: int) -> np.ndarray:
-        with self._named_errors():
+        with readable(self._where, "an array", *NPZ_ERRORS):
             self._file.seek(self._start + first * self.dtype.itemsize)
             data = self._file.read(count * self.dtype.itemsize)
             if len(data) != count * self.dtype.itemsize:
@@ -196,11 +185,8 @@ class NpzArray:
 def npz_members(path: Path) -> tuple[str, ...]:
     """Names of the members, ordered by the numbers in them."""
     check_regular(path)
-    try:
-        with zipfile.ZipFile(path) as file:
-            items = [item for item in file.infolist() if item.filename.endswith(".npy")]
-    except NPZ_ERRORS as error:
-        raise DataError(f"{path}: cannot be read as .npz ({error}). Copy or download it again.") from error
+    with readable(path, ".npz", *NPZ_ERRORS), zipfile.ZipFile(path) as file:
+        items = [item for item in file.infolist() if item.filename.endswith(".npy")]
     if not items:
         raise DataError(f"{path}: the file has no array.")
     unpacked = sum(item.file_size for item in items)

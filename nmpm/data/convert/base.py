@@ -6,15 +6,16 @@ import abc
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, get_args
 
-from nmpm._support.messages import suggestion
+from nmpm._support.messages import one_line, suggestion
 from nmpm.data.format import OTHER_NAMES, SPLITS, Metadata, Trajectory
 from nmpm.data.metadata import STATIC_NAMES
-from nmpm.errors import ConfigError, DataError
+from nmpm.errors import ConfigError, DataError, NmpmError
 from nmpm.scene import Boundary, Interval, check_field_names
 
 UNKNOWN_LENGTH = 0
@@ -204,6 +205,29 @@ class FileFormat(DatasetFormat):
     def _read_all(self, files: tuple[Path, ...], metadata: Metadata, options: Options) -> Iterator[Trajectory]:
         for file in files:
             yield from self.read(file, metadata, options)
+
+
+@contextmanager
+def readable(where: Path | str, kind: str, *errors: type[Exception]) -> Iterator[None]:
+    """Turns errors of a file, these and the usual ones, into a DataError: it cannot be read as `kind`."""
+    kinds: tuple[type[Exception], ...] = (*errors, OSError, EOFError, ValueError, MemoryError)
+    try:
+        yield
+    except NmpmError:
+        raise
+    except kinds as error:
+        hint = "" if type(error) is ValueError else " Is it complete? Copy it again."
+        reason = one_line(error) or type(error).__name__
+        raise DataError(f"{where}: cannot be read as {kind} ({reason}).{hint}") from error
+
+
+@contextmanager
+def located(where: Path | str) -> Iterator[None]:
+    """Puts a file or trajectory in front of the message of a DataError."""
+    try:
+        yield
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from error
 
 
 def split_files(path: Path, *patterns: str, unsplit: str = "test") -> dict[str, tuple[Path, ...]]:

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from nmpm.data.convert.base import FileFormat, Options
+from nmpm.data.convert.base import FileFormat, Options, located
 from nmpm.data.convert.tfrecord import Feature, SequenceExample, read_record, record_offsets
 from nmpm.data.format import METADATA_FILE, Metadata, Trajectory, read_metadata
 from nmpm.errors import DataError
@@ -57,11 +57,9 @@ def _trajectory(example: SequenceExample, dim: int, where: str) -> Trajectory:
         for name, steps in example.steps.items()
         if name != "position"
     }
-    try:
+    with located(where):
         position = np.stack(frames).reshape(len(frames), particles, dim)
         return Trajectory(position, particle_type, attributes, fields)
-    except DataError as error:
-        raise DataError(f"{where}: {error}") from error
 
 
 def _numbers(feature: Feature, kind: np.dtype[Any], where: str) -> np.ndarray:

@@ -17,11 +17,11 @@ import numpy as np
 
 from nmpm._support.bounded_files import EXPANSION, check_regular, expansion_limit
 from nmpm._support.messages import one_line
-from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options
+from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options, located, readable
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.metadata import find_family
 from nmpm.data.statistics import extent_of
-from nmpm.errors import ConfigError, DataError, NmpmError
+from nmpm.errors import ConfigError, DataError
 
 _FLUID, _WALL = 0, 1
 _DT, _GRAVITY = 0.02, -9.81
@@ -75,20 +75,18 @@ def _frames(path: Path) -> Iterator[dict[str, Any]]:
     except ImportError as error:
         raise ConfigError(f"{path}: reading it needs more packages: pip install 'nmpm[convert]'.") from error
     check_regular(path)
-    try:
-        with path.open("rb") as file, zstandard.ZstdDecompressor().stream_reader(file) as stream:
-            reader = msgpack.Unpacker(
-                stream, raw=True, max_buffer_size=_FRAME_BYTES, max_array_len=_ITEMS, max_map_len=_ITEMS
-            )
-            for index in range(reader.read_array_header()):
-                yield _decode_frame(reader.unpack(), f"{path}, frame {index}")
-                if reader.tell() > expansion_limit(path.stat().st_size):
-                    raise ValueError(f"it unpacks to more than {EXPANSION} times its size")
-    except NmpmError:
-        raise
-    except (zstandard.ZstdError, msgpack.UnpackException, ValueError, OSError, RecursionError, MemoryError) as error:
-        reason = one_line(error) or type(error).__name__
-        raise DataError(f"{path}: cannot be read ({reason}). Is it complete? Copy or download it again.") from error
+    with (
+        readable(path, "DMCF's frames", zstandard.ZstdError, msgpack.UnpackException, RecursionError),
+        path.open("rb") as file,
+        zstandard.ZstdDecompressor().stream_reader(file) as stream,
+    ):
+        reader = msgpack.Unpacker(
+            stream, raw=True, max_buffer_size=_FRAME_BYTES, max_array_len=_ITEMS, max_map_len=_ITEMS
+        )
+        for index in range(reader.read_array_header()):
+            yield _decode_frame(reader.unpack(), f"{path}, frame {index}")
+            if reader.tell() > expansion_limit(path.stat().st_size):
+                raise ValueError(f"it unpacks to more than {EXPANSION} times its size")
 
 
 def _decode_frame(frame: Any, where: str) -> dict[str, Any]:
@@ -145,11 +143,9 @@ def _trajectory(frames: list[dict[str, Any]], path: Path) -> Trajectory:
     gravity = first.get("grav")
     if isinstance(gravity, np.ndarray) and gravity.shape == (fluid.shape[2],):
         attributes["gravity"] = gravity.astype(np.float64)
-    try:
+    with located(path):
         position = np.concatenate([fluid, still], axis=1).astype(np.float32)
         return Trajectory(position, kinds, attributes, _fields(frames))
-    except DataError as error:
-        raise DataError(f"{path}: {error}") from error
 
 
 def _fields(frames: list[dict[str, Any]]) -> dict[str, np.ndarray]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from nmpm._support.messages import one_line
 from nmpm.data.convert.array_files import NpzArray, npz_members
-from nmpm.data.convert.base import FileFormat, Options
+from nmpm.data.convert.base import FileFormat, Options, located
 from nmpm.data.convert.restricted_pickle import load_pickled, number_array
 from nmpm.data.format import METADATA_FILE, Metadata, Trajectory, read_metadata
 from nmpm.errors import DataError
@@ -69,10 +69,8 @@ def _trajectory(row: Any, where: str) -> Trajectory:
     fields = {}
     if len(parts) == 3:
         fields["material_property"] = _per_particle(parts[2], position.shape[1], f"{where}: material property")
-    try:
+    with located(where):
         return Trajectory(position.astype(np.float32), types, {}, fields)
-    except DataError as error:
-        raise DataError(f"{where}: {error}") from error
 
 
 def _per_particle(value: Any, particles: int, where: str) -> np.ndarray:

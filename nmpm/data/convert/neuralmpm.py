@@ -15,7 +15,7 @@ from typing import ClassVar
 import h5py
 import numpy as np
 
-from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options, split_files
+from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options, located, split_files
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
 from nmpm.data.metadata import find_family
@@ -145,10 +145,8 @@ def _trajectory(content: dict[str, np.ndarray], material: int | None, path: Path
     kinds = np.concatenate([types[-particles:], np.full(wall.shape[1], _BOUNDARY)]).astype(np.int64)
     gravity = content[_GRAVITY].astype(np.float64) if _GRAVITY in content else np.empty(0)
     attributes = {"gravity": gravity.reshape(dim)} if gravity.size == dim else {}
-    try:
+    with located(path):
         return Trajectory(np.concatenate([moving, wall], axis=1).astype(np.float32), kinds, attributes, content)
-    except DataError as error:
-        raise DataError(f"{path}: {error}") from error
 
 
 def _positions(content: dict[str, np.ndarray], name: str, path: Path) -> np.ndarray:

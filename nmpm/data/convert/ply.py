@@ -10,10 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from nmpm._support.bounded_files import check_regular
-from nmpm._support.messages import one_line
+from nmpm.data.convert.base import readable
 from nmpm.data.convert.frame import Frame
 from nmpm.data.convert.frame_files import FrameFormat
 from nmpm.data.convert.named_arrays import AXES
+from nmpm.data.convert.text_lines import is_number
 from nmpm.errors import ConfigError, DataError
 
 _TIME = re.compile(r"time\W+([-+.\deE]+)\s*$", re.IGNORECASE)
@@ -32,10 +33,8 @@ class Ply(FrameFormat):
             import plyfile
         except ImportError as error:
             raise ConfigError(f'{file}: reading PLY needs plyfile: pip install "nmpm[vtk]".') from error
-        try:
+        with readable(file, "PLY", plyfile.PlyParseError):
             content = plyfile.PlyData.read(str(file))
-        except (plyfile.PlyParseError, OSError, ValueError, MemoryError, UnicodeDecodeError) as error:
-            raise DataError(f"{file}: cannot be read as PLY ({one_line(error)}). Is it complete?") from error
         yield _frame(content, file)
 
 
@@ -53,11 +52,5 @@ def _frame(content: Any, file: Path) -> Frame:
         *(name for name in elements if name != "vertex"),
         *(name for name in names if vertices[name].dtype == object),
     )
-    return Frame(position, arrays, next((_number(match[1]) for match in times if match), None), left_out=left_out)
-
-
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None
+    stated = next((match[1] for match in times if match), "")
+    return Frame(position, arrays, float(stated) if is_number(stated) else None, left_out=left_out)

@@ -11,7 +11,7 @@ from typing import Any, get_args
 import numpy as np
 
 from nmpm.data.array_checks import check_axes
-from nmpm.data.convert.base import find_split_name
+from nmpm.data.convert.base import find_split_name, located
 from nmpm.data.convert.named_arrays import (
     ArrayLike,
     Arrays,
@@ -167,10 +167,8 @@ class RunArrays:
         gravity = self._fact("gravity", run)
         stated = gravity is not None and gravity.ndim == 1 and len(gravity) >= metadata.dim
         attributes = {"gravity": gravity[: metadata.dim].astype(np.float64)} if gravity is not None and stated else {}
-        try:
+        with located(where):
             trajectory = Trajectory(position, fixed, attributes, self._fields(run, metadata.dim))
-        except DataError as error:
-            raise DataError(f"{where}: {error}") from error
         return cut(trajectory, range(len(position)))
 
     def _types(self, run: int, sizes: tuple[int, ...], metadata: Metadata, where: str) -> np.ndarray | None:

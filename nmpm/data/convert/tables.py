@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import csv
-import gzip
 import re
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import islice
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 
-from nmpm._support.bounded_files import check_regular, expansion_limit
-from nmpm._support.messages import one_line
+from nmpm._support.bounded_files import check_regular
 from nmpm._support.progress import progress_bar
-from nmpm.errors import ConfigError, DataError, NmpmError
+from nmpm.data.convert.base import readable
+from nmpm.data.convert.text_lines import Lines, is_number, open_lines
+from nmpm.errors import ConfigError, DataError
 
 SUFFIXES = ("*.csv", "*.csv.gz", "*.tsv", "*.tsv.gz", "*.txt", "*.txt.gz", "*.parquet")
 ROWS = 100_000
 """Rows of a chunk."""
 _UNITS = "[nuµμmck]?m|px|pixels?|[nuµμm]?s|sec|kg|g"
 _LARGE = 32  # MiB of a file beyond which its progress is shown
-_LINE = 2**16  # characters of a line
-_BLOCK = 2**22  # characters that are parsed at a time
+_BLOCK = 2**22  # bytes that are parsed at a time
 
 Chunk = Mapping[str, np.ndarray]
 """Columns by name, floats or texts."""
@@ -36,8 +33,8 @@ def read_columns(path: Path) -> tuple[str, ...]:
     if path.suffix == ".parquet":
         with _open_parquet(path) as file:
             return tuple(map(str, file.schema_arrow.names))
-    with _open_text(path) as file:
-        return _header(file)[0]
+    with open_lines(path, "a table") as lines:
+        return _header(lines)[0]
 
 
 def read_chunks(path: Path, columns: Sequence[str]) -> Iterator[Chunk]:
@@ -52,46 +49,35 @@ def read_chunks(path: Path, columns: Sequence[str]) -> Iterator[Chunk]:
             for batch in file.iter_batches(batch_size=ROWS, columns=list(columns)):
                 yield {name: _arrow_column(batch.column(name)) for name in columns}
         return
-    limit = expansion_limit(path.stat().st_size)
-    with _open_text(path) as file, _progress(path) as advance_to:
-        names, delimiter, number = _header(file)
-        for lines in _blocks(file):
-            advance_to(file)
-            if path.suffix == ".gz" and file.buffer.tell() > limit:
-                raise DataError(f"{path}: unpacks to more than {limit:,} bytes.")
-            rows = [line for line in lines if line.strip() and line[0] not in "#%"]
+    with open_lines(path, "a table") as lines, _progress(path) as advance_to:
+        names, delimiter = _header(lines)
+        before = lines.number
+        while texts := lines.texts(_BLOCK):
+            advance_to(lines.stored)
+            rows = [line for line in texts if line.strip() and line[0] not in "#%"]
             table = _parse(rows, names, delimiter)
             if table is None:
-                raise _cells_error(path, lines, number, len(names), delimiter)
+                raise _cells_error(path, texts, before, len(names), delimiter)
             if table:
                 yield {name: table[name] for name in columns}
-            number += len(lines)
+            before = lines.number
 
 
 @contextmanager
-def _progress(path: Path) -> Iterator[Callable[[Any], object]]:
-    """A function that shows how much of a large text file is read, of which the open file is its argument."""
+def _progress(path: Path) -> Iterator[Callable[[int], object]]:
+    """A function that shows how many bytes of a large text file are read."""
     total, done = path.stat().st_size // 2**20, 0
     if total < _LARGE:
         yield lambda _: None
         return
 
-    def advance_to(file: Any) -> None:
+    def advance_to(stored: int) -> None:
         nonlocal done
-        now = getattr(file.buffer, "fileobj", file.buffer).tell() // 2**20  # of what is stored
-        step(by=now - done)
-        done = now
+        step(by=stored // 2**20 - done)
+        done = stored // 2**20
 
     with progress_bar(f"Reading {path.name}, MiB", total) as step:
         yield advance_to
-
-
-def _blocks(file: TextIO) -> Iterator[list[str]]:
-    """Yields the lines of a file, many at a time."""
-    while text := file.read(_BLOCK):
-        if not text.endswith("\n"):
-            text += file.readline(_LINE)
-        yield text.replace("\r", "").removesuffix("\n").split("\n")
 
 
 def _parse(rows: list[str], names: Sequence[str], delimiter: str | None) -> Chunk | None:
@@ -103,7 +89,7 @@ def _parse(rows: list[str], names: Sequence[str], delimiter: str | None) -> Chun
     except ValueError:  # texts, empty cells
         pass
     cells = [row.split() for row in rows] if delimiter is None else list(csv.reader(rows, delimiter=delimiter))
-    while cells and not any(map(_is_number, cells[0])):  # labels and units below the header have no numbers
+    while cells and not any(map(is_number, cells[0])):  # labels and units below the header have no numbers
         cells.pop(0)
     if any(len(row) != len(names) for row in cells):
         return None
@@ -119,30 +105,22 @@ def _cells_error(path: Path, lines: list[str], first: int, count: int, delimiter
     return DataError(f"{path}: rows have another number of cells than the header, {count}.")
 
 
-def _header(file: TextIO) -> tuple[tuple[str, ...], str | None, int]:
-    """Names of columns, the delimiter (None for blanks), and the number of the header's line."""
-    for number, line in enumerate(islice(iter(lambda: file.readline(_LINE), ""), 100), start=1):
-        text = line.strip().lstrip("\ufeff#%").strip()
+def _header(lines: Lines) -> tuple[tuple[str, ...], str | None]:
+    """Names of columns, and the delimiter (None for blanks)."""
+    for _ in range(100):
+        text = lines.next().strip().lstrip("\ufeff#%").strip()
         if not text:
             continue
         delimiter = next((sign for sign in "\t;," if sign in text), None)
         names = [name or f"column {index}" for index, name in enumerate(_split(text, delimiter))]  # pandas' index
-        named = len(set(names)) == len(names) and not any(map(_is_number, names))
-        return (tuple(names) if named and len(names) > 1 else (), delimiter, number)
-    return (), None, 0
+        named = len(set(names)) == len(names) and not any(map(is_number, names))
+        return (tuple(names) if named and len(names) > 1 else (), delimiter)
+    return (), None
 
 
 def _split(text: str, delimiter: str | None) -> list[str]:
     cells = text.split() if delimiter is None else next(csv.reader([text], delimiter=delimiter))
     return [cell.strip().strip('"') for cell in cells]
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _column(cells: list[str]) -> np.ndarray:
@@ -160,20 +138,6 @@ def _column(cells: list[str]) -> np.ndarray:
 
 
 @contextmanager
-def _open_text(path: Path) -> Iterator[TextIO]:
-    """The text of a file that may be gzipped; errors name the file."""
-    check_regular(path)
-    try:
-        opener: Any = gzip.open if path.suffix == ".gz" else open
-        with opener(path, "rt", encoding="utf-8", errors="replace", newline="") as file:
-            yield file
-    except NmpmError:
-        raise
-    except (OSError, EOFError, zlib.error, csv.Error) as error:
-        raise DataError(f"{path}: cannot be read ({one_line(error)}). Is it complete? Copy it again.") from error
-
-
-@contextmanager
 def _open_parquet(path: Path) -> Iterator[Any]:
     try:
         import pyarrow
@@ -181,23 +145,16 @@ def _open_parquet(path: Path) -> Iterator[Any]:
     except ImportError as error:
         raise ConfigError(f'{path}: reading Parquet needs pyarrow: pip install "nmpm[tables]".') from error
     check_regular(path)
-    try:
-        with pyarrow.parquet.ParquetFile(path) as file:
-            yield file
-    except NmpmError:
-        raise
-    except (pyarrow.ArrowException, OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as Parquet ({one_line(error)}). Copy it again.") from error
+    with readable(path, "Parquet", pyarrow.ArrowException), pyarrow.parquet.ParquetFile(path) as file:
+        yield file
 
 
 def _arrow_column(column: Any) -> np.ndarray:
     values = np.asarray(column.to_numpy(zero_copy_only=False))
     if values.dtype.kind in "biuf":
         return values.astype(np.float64)
-    if values.dtype.kind in "mM":
-        return (
-            values.astype("datetime64[ns]" if values.dtype.kind == "M" else "timedelta64[ns]").astype(np.int64) * 1e-9
-        )
+    if values.dtype.kind in "mM":  # dates and durations, in seconds
+        return values.astype(f"{values.dtype.kind}8[ns]").astype(np.int64) * 1e-9
     return _column(["" if item is None else str(item) for item in values.tolist()])
 
 

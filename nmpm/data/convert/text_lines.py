@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import gzip
 import io
 import zlib
@@ -14,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.bounded_files import EXPANSION, check_regular, expansion_limit
-from nmpm._support.messages import one_line
-from nmpm.errors import DataError, NmpmError
+from nmpm.data.convert.base import readable
 
 _LINE_BYTES = 2**20
 
@@ -39,11 +39,21 @@ class Lines:
         Raises:
             ValueError: if it is very long.
         """
-        line = self._file.readline(_LINE_BYTES)
-        if len(line) == _LINE_BYTES:
-            raise ValueError(f"line {self.number + 1} has more than {_LINE_BYTES:,} characters")
-        self._count([line])
+        line = self._rest_of_line()
+        self._count(1, len(line))
         return line.decode("utf-8", "replace").rstrip() or (" " if line else "")
+
+    def texts(self, size: int) -> list[str]:
+        """The next lines without their ends, of about so many bytes; none at the end of the file.
+
+        Raises:
+            ValueError: if one is very long.
+        """
+        data: bytes = self._file.read(size)
+        data += self._rest_of_line() if data and not data.endswith(b"\n") else b""
+        lines = data.decode("utf-8", "replace").replace("\r", "").removesuffix("\n").split("\n") if data else []
+        self._count(len(lines), len(data))
+        return lines
 
     def block(self, count: int, start: int) -> list[bytes]:
         """The next lines, which belong to a frame that began after `start` lines.
@@ -52,14 +62,25 @@ class Lines:
             ValueError: if there are fewer, or the last one is cut short.
         """
         lines = list(islice(self._file, count))
-        self._count(lines)
+        self._count(len(lines), sum(map(len, lines)))
         if len(lines) < count or (lines and not lines[-1].endswith(b"\n")):
             raise ValueError(f"it ends at line {self.number}, within a frame{complete_frames(start)}")
         return lines
 
-    def _count(self, lines: Sequence[bytes]) -> None:
-        self.number += len(lines)
-        self._left -= sum(map(len, lines))
+    @property
+    def stored(self) -> int:
+        """Bytes of the file that were read, as they are stored."""
+        return int(getattr(self._file.raw, "fileobj", self._file).tell())
+
+    def _rest_of_line(self) -> bytes:
+        line: bytes = self._file.readline(_LINE_BYTES)
+        if len(line) == _LINE_BYTES:
+            raise ValueError(f"line {self.number + 1} has more than {_LINE_BYTES:,} characters")
+        return line
+
+    def _count(self, lines: int, size: int) -> None:
+        self.number += lines
+        self._left -= size
         if self._left < 0:
             raise ValueError(f"it unpacks to more than {EXPANSION} times its size")
 
@@ -77,17 +98,13 @@ def open_lines(path: Path, kind: str) -> Iterator[Lines]:
         DataError: naming the file, for its errors and any ValueError within; `kind` is what it should be.
     """
     check_regular(path)
-    try:
-        packed = path.suffix.lower() == ".gz"
-        size = path.stat().st_size
+    packed, size = path.suffix.lower() == ".gz", path.stat().st_size
+    with (
+        readable(path, kind, zlib.error, csv.Error),
         # The buffer reads lines several times faster than GzipFile.
-        with io.BufferedReader(gzip.GzipFile(path), _LINE_BYTES) if packed else path.open("rb") as file:
-            yield Lines(file, expansion_limit(size) if packed else 2 * size + 1)
-    except NmpmError:
-        raise
-    except (OSError, EOFError, zlib.error, ValueError, MemoryError) as error:
-        hint = "" if isinstance(error, ValueError) else " Is it complete?"
-        raise DataError(f"{path}: cannot be read as {kind} ({one_line(error)}).{hint}") from error
+        io.BufferedReader(gzip.GzipFile(path), _LINE_BYTES) if packed else path.open("rb") as file,
+    ):
+        yield Lines(file, expansion_limit(size) if packed else 2 * size + 1)
 
 
 def parse_columns(lines: Sequence[bytes], names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -99,7 +116,7 @@ def parse_columns(lines: Sequence[bytes], names: Sequence[str]) -> dict[str, np.
     first = lines[0].split() if lines else []
     if lines and len(first) != len(names):
         raise ValueError(f"{len(first)} columns, but {len(names)} names: {' '.join(names)}")
-    texts = [index for index, word in enumerate(first) if not _is_number(word)]
+    texts = [index for index, word in enumerate(first) if not is_number(word)]
     numbers = [index for index in range(len(names)) if index not in texts]
     if not lines:
         return {name: np.zeros(0) for name in names}
@@ -115,7 +132,8 @@ def parse_columns(lines: Sequence[bytes], names: Sequence[str]) -> dict[str, np.
     return columns
 
 
-def _is_number(word: bytes) -> bool:
+def is_number(word: str | bytes) -> bool:
+    """Whether a word is a number."""
     try:
         float(word)
     except ValueError:

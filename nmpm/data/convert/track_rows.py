@@ -73,7 +73,8 @@ class TrackRows:
             fields["velocity"] = np.full_like(position, np.nan)
             fields["velocity"][frame_of, slot] = self.velocity
         if self.time is not None:
-            fields["time"] = _frame_times(self.time, frame_of, frames)
+            with_rows, first = np.unique(frame_of, return_index=True)
+            fields["time"] = np.interp(np.arange(frames), with_rows, self.time[first])
         return Trajectory(position, kinds, {}, fields)
 
     def _check_rows(self, track: np.ndarray, frame_of: np.ndarray, where: str) -> None:
@@ -119,17 +120,6 @@ def frame_numbers(key: np.ndarray) -> tuple[np.ndarray, int]:
     if regular and grid[-1] < _GAPS * len(values):
         return grid[index], int(grid[-1]) + 1
     return index, len(values)
-
-
-def _frame_times(time: np.ndarray, frame_of: np.ndarray, frames: int) -> np.ndarray:
-    """(T,) times of frames, interpolated where there is no row."""
-    present, first = np.unique(frame_of, return_index=True)
-    if len(present) > 1 and len(present) < frames:
-        slope = (time[first[-1]] - time[first[0]]) / (present[-1] - present[0])
-        if np.abs(time[first] - time[first[0]] - slope * (present - present[0])).max() <= _JITTER * abs(slope):
-            times: np.ndarray = time[first[0]] + slope * (np.arange(frames) - present[0])
-            return times
-    return np.asarray(np.interp(np.arange(frames), present, time[first]))
 
 
 def assign_slots(track: np.ndarray, frame_of: np.ndarray, types: np.ndarray) -> np.ndarray:
