@@ -56,25 +56,19 @@ class ArrayFiles(RunFiles):
             if not groups:
                 raise DataError(f"{file}: no array can be positions ({describe(arrays)}). Move it to another folder.")
         numbered = [group for group in groups for _ in range(group.count)]
-        return [Run(file, index, split=group.split) for index, group in enumerate(numbered)]
-
-    def frames(self, run: Run) -> int:
-        with open_arrays(run.file) as arrays:
-            groups = list(group_runs(arrays, str(run.file)))
-        return [group.frames for group in groups for _ in range(group.count)][run.index]
+        return [Run(file, index, group.frames, group.split) for index, group in enumerate(numbered)]
 
     def facts(self, file: Path) -> Facts:
         with open_arrays(file) as arrays:
             return next(group_runs(arrays, str(file))).facts()
 
     def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:
-        wanted, offset = set(indices), 0
+        wanted = set(indices)
         with open_arrays(file) as arrays:
-            for group in group_runs(arrays, str(file)):
-                for run in range(group.count):
-                    if offset + run in wanted:
-                        yield group.read(run, metadata)
-                offset += group.count
+            runs = ((group, run) for group in group_runs(arrays, str(file)) for run in range(group.count))
+            for index, (group, run) in enumerate(runs):
+                if index in wanted:
+                    yield group.read(run, metadata)
 
 
 def is_array_folder(path: Path) -> bool:

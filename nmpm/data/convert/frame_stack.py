@@ -53,7 +53,7 @@ class FrameStack:
         if frame is not None and len(frame.position):
             self._add_particles(frame, where)
         else:
-            self._empty = self._empty or (where if frame else "")
+            self._empty = self._empty or where
             self._reserve(self._count + 1, self._particles)
         self._times.append(np.nan if frame is None or frame.time is None else frame.time)
         self._count += 1
@@ -80,9 +80,20 @@ class FrameStack:
             values["position"][~arrays.present] = np.nan
         if arrays.velocity is not None:
             values["velocity"] = arrays.velocity
-        for name, array in values.items():
-            self._set(name, slots, array, first)
-        self._leave_out(set(values), where)
+        if first:
+            self._values = {name: self._empty_array(array) for name, array in values.items()}
+        for name in sorted((set(self._values) ^ set(values)) - self._left_out):
+            _log.warning("%s: the array %r is not in all frames; it is left out.", where, one_line(name, 60))
+            self._left_out.add(name)
+            self._values.pop(name, None)
+        for name, array in self._values.items():
+            array[self._count, slots] = values[name]
+
+    def _empty_array(self, values: np.ndarray) -> np.ndarray:
+        """An array of all frames for values as those of one."""
+        exact = values.dtype.kind in "iu" and values.dtype.itemsize > 2
+        shape = (self._frames, self._room, *values.shape[1:])
+        return np.full(shape, np.nan, np.float64 if exact else np.float32)
 
     def _position(self, values: np.ndarray, where: str) -> np.ndarray:
         """(N, D) float32 of the axes that are kept."""
@@ -143,22 +154,6 @@ class FrameStack:
         if particles > self._particles:
             self._types = np.concatenate([self._types, np.full(particles - self._particles, _ABSENT_TYPE)])
             self._particles = particles
-
-    def _set(self, name: str, slots: np.ndarray | slice, values: np.ndarray, first: bool) -> None:
-        """Sets a frame's values; arrays that only later frames have are left out."""
-        if first:
-            exact = values.dtype.kind in "iu" and values.dtype.itemsize > 2
-            shape = (self._frames, self._room, *values.shape[1:])
-            self._values[name] = np.full(shape, np.nan, np.float64 if exact else np.float32)
-        if name in self._values:
-            self._values[name][self._count, slots] = values
-
-    def _leave_out(self, names: set[str], where: str) -> None:
-        """Drops arrays that are not in all frames, with a warning; `names` are those of a frame."""
-        for name in sorted((set(self._values) ^ names) - self._left_out):
-            _log.warning("%s: the array %r is not in all frames; it is left out.", where, one_line(name, 60))
-            self._left_out.add(name)
-            self._values.pop(name, None)
 
     def _merge_types(self, types: np.ndarray, slots: np.ndarray | slice, where: str) -> None:
         """Notes the types of particles that are there for the first time, and checks the others."""

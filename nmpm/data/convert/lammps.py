@@ -52,8 +52,7 @@ class Lammps(FrameFormat):
     def frames(self, file: Path) -> Iterator[Frame]:
         before, repeated = None, 0
         with open_lines(file, "a LAMMPS dump") as lines:
-            while (header := _header(lines)) is not None:
-                block = lines.block(header.count, header.start)
+            for header, block in _blocks(lines):
                 # A simulation that goes on writes the last frame of the one before again.
                 if header.step == before:
                     repeated += 1
@@ -64,12 +63,8 @@ class Lammps(FrameFormat):
             _log.warning("%s: %s repeated the timestep before and left out.", file, counted(repeated, "frame"))
 
     def count(self, file: Path) -> int:
-        number = 0
         with open_lines(file, "a LAMMPS dump") as lines:
-            while (header := _header(lines)) is not None:
-                lines.block(header.count, header.start)
-                number += 1
-        return number
+            return sum(1 for _ in _blocks(lines))
 
     def notes(self, frames: Sequence[Frame], options: Options) -> tuple[str, ...]:
         steps = [frame.step for frame in frames if frame.step is not None]
@@ -77,6 +72,12 @@ class Lammps(FrameFormat):
             return ()
         apart = steps[1] - steps[0]
         return (f"Frames are {apart} steps of LAMMPS apart; if dt is not the time between them, state it: --dt.",)
+
+
+def _blocks(lines: Lines) -> Iterator[tuple[_Header, list[bytes]]]:
+    """Yields the header and the lines of particles of each frame."""
+    while (header := _header(lines)) is not None:
+        yield header, lines.block(header.count, header.start)
 
 
 def _header(lines: Lines) -> _Header | None:

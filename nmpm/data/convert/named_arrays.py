@@ -124,7 +124,7 @@ def drop_axes(position: np.ndarray, dim: int, where: str) -> np.ndarray:
     """The first axes of (…, D) positions; raises a DataError if the others are not 0 everywhere."""
     if position.shape[-1] < dim:
         raise DataError(f"{where}: positions have {position.shape[-1]} axes, those of the first run have {dim}.")
-    if position[..., dim:].any():
+    if np.nan_to_num(position[..., dim:]).any():
         raise DataError(f"{where}: z is 0 in the first run, but not here. Give all runs the same number of axes.")
     return position[..., :dim]
 
