@@ -13,6 +13,7 @@ from pathlib import Path
 
 from nmpm._support.atomic import lock_folder
 from nmpm._support.shipped import user_home
+from nmpm._support.version import __version__
 from nmpm.data.convert.array_files import ArrayFiles
 from nmpm.data.convert.base import DatasetFormat as DatasetFormat
 from nmpm.data.convert.base import ForeignDataset as ForeignDataset
@@ -119,7 +120,7 @@ def convert(
 def native_folder(path: Path, options: Options | None = None, format_name: str | None = None) -> Path:
     """A folder in the native layout with the same data, converted in the cache now or by an earlier call.
 
-    The dataset is converted again when the size or time of a source file, or an option, has changed.
+    The dataset is converted again when the size or time of a source file, an option or the version of nmpm has changed.
 
     Raises:
         DataError: if the source cannot be read or the cache cannot be written.
@@ -184,5 +185,5 @@ def _fingerprint(path: Path, options: Options, format_name: str | None) -> str:
         else value
         for value in vars(options).values()
     ]
-    identity = repr((str(path), ordered, stamps, *([format_name] if format_name else [])))
+    identity = repr((__version__, str(path), ordered, stamps, format_name))
     return hashlib.sha256(identity.encode()).hexdigest()[:10]
