@@ -36,7 +36,6 @@ class Sample:
     types: np.ndarray  # (P,)
     time: np.ndarray | None  # (F,) in the file's unit
     velocity: np.ndarray | None  # (F, P, D) in length per unit of time, where the file has velocities
-    whole: bool  # whether the frames reach to the trajectory's end
     first: Snapshot  # of the first frame, or the first of those with most particles
     last: Snapshot  # of the last frame with at least half as many
 
@@ -64,14 +63,12 @@ def take_sample(trajectory: Trajectory) -> Sample:
     length = min(frames, max(2, _BYTES // (row * len(index))))
     present = np.isfinite(position[..., 0]).sum(axis=1)
     fullest, last = int(present.argmax()), int(np.flatnonzero(2 * present >= present.max())[-1])
-    fields = trajectory.fields
-    time, velocity = fields.get("time"), fields.get("velocity")
+    time, velocity = trajectory.fields.get("time"), trajectory.fields.get("velocity")
     return Sample(
         position=position[:length, index],
         types=types[index],
         time=None if time is None or np.shape(time) != (frames,) else np.asarray(time, np.float64)[:length],
         velocity=None if velocity is None or velocity.shape != position.shape else velocity[:length, index],
-        whole=length == frames,
         first=_snapshot(position[fullest], types),
         last=_snapshot(position[last], types),
     )
@@ -122,6 +119,3 @@ class Samples:
 
     def __iter__(self) -> Iterator[Sample]:
         return iter(self._kept)
-
-    def __len__(self) -> int:
-        return len(self._kept)

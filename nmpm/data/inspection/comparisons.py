@@ -73,10 +73,7 @@ def compare_domains(
 ) -> Iterator[Finding]:
     """Yields a finding if particles of a trajectory stay far beyond a place at which those of many others end.
 
-    Args:
-        extents: (D, 2) lowest and highest coordinates, by trajectory.
-        stays: (D, 2) share of the frames in which a particle is near these.
-        spacing: Distance of particles.
+    By trajectory: (D, 2) lowest and highest coordinates, and the share of frames in which a particle is near these.
     """
     if len(extents) < 3:
         return
@@ -147,12 +144,8 @@ def check_periods(
 ) -> Iterator[Finding]:
     """Yields a finding if particles never cross the ends of a periodic axis, but turn back from them.
 
-    Args:
-        metadata: As stated.
-        wraps: (D,) number of steps across the ends.
-        bounces: (D, 2) how often particles turn back from the lower and the upper end.
-        walls: Of static particles; where these are at the ends, a model may do without the wall.
-        spacing: Distance of particles.
+    `wraps` (D,) and `bounces` (D, 2) say how often. Where static particles, `walls`, are at the ends, a model may do
+    without the wall.
     """
     lower, upper = np.asarray(metadata.bounds).T
     solid = (walls.lower < lower + _SOLID * spacing) | (walls.upper > upper - _SOLID * spacing)

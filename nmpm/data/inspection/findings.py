@@ -17,25 +17,15 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """Something to know about a dataset, or about one of its trajectories.
+    """Something to know about a dataset, or about one of its trajectories."""
 
-    Args:
-        kind: What it is about, e.g. "gravity" or "jumps"; findings of a kind are shown in one line.
-        severity: How bad it is.
-        sentence: What is wrong and how to mend it.
-        where: The trajectory, e.g. "train 00003"; empty if it is about the dataset.
-        details: Where in the trajectory, e.g. "frame 12, particle 5".
-        factor: By how much a stated value is too large, or a measured one; None where there is no such number.
-        badness: Orders findings of a kind, the larger the worse.
-    """
-
-    kind: str
+    kind: str  # what it is about, e.g. "gravity" or "jumps"; findings of a kind are shown in one line
     severity: Severity
-    sentence: str
-    where: str = ""
-    details: str = ""
-    factor: float | None = None
-    badness: float = 0.0
+    sentence: str  # what is wrong and how to mend it
+    where: str = ""  # the trajectory, e.g. "train 00003"; empty if it is about the dataset
+    details: str = ""  # where in the trajectory, e.g. "frame 12, particle 5"
+    factor: float | None = None  # by how much a stated value is too large, or a measured one
+    badness: float = 0.0  # orders findings of a kind
 
     def __str__(self) -> str:
         return ": ".join(filter(None, (self.kind, ", ".join(filter(None, (self.where, self.details))), self.sentence)))

@@ -22,17 +22,11 @@ _RESTLESS = 0.2  # likewise: particles whose typical step is longer do not cross
 
 @dataclass(frozen=True)
 class Motion:
-    """The motion of a trajectory's N moving particles over T frames; NaN where a particle is absent.
+    """The motion of a trajectory's N moving particles over T frames; NaN where a particle is absent."""
 
-    Args:
-        trajectory: The trajectory, with its fields.
-        metadata: As stated.
-        where: The trajectory in words, e.g. "train 00003".
-    """
-
-    trajectory: Trajectory
-    metadata: Metadata
-    where: str
+    trajectory: Trajectory  # with its fields
+    metadata: Metadata  # as stated
+    where: str  # the trajectory in words, e.g. "train 00003"
 
     @cached_property
     def index(self) -> np.ndarray:
@@ -73,17 +67,13 @@ class Motion:
     @cached_property
     def extent(self) -> np.ndarray:
         """(D, 2) lowest and highest coordinates."""
-        axes = [self.position[..., axis] for axis in range(self.position.shape[-1])]
-        return np.array([[np.nanmin(values), np.nanmax(values)] for values in axes], dtype=np.float64)
+        return np.stack([ends.reduce(self.position, axis=(0, 1)) for ends in (np.fmin, np.fmax)], 1, dtype=np.float64)
 
     @cached_property
     def stays(self) -> np.ndarray:
         """(D, 2) share of the frames in which a particle is within a spacing of the lowest or highest coordinates."""
-        axes = [self.position[..., axis] for axis in range(self.position.shape[-1])]
-        low, high = self.extent[:, 0] + self.spacing, self.extent[:, 1] - self.spacing
-        return np.array(
-            [[(x < a).any(axis=1).mean(), (x > b).any(axis=1).mean()] for x, a, b in zip(axes, low, high, strict=True)]
-        )
+        low, high = self.extent.T + np.array([[self.spacing], [-self.spacing]])
+        return np.stack([near.any(axis=1).mean(axis=0) for near in (self.position < low, self.position > high)], axis=1)
 
     @cached_property
     def crossings(self) -> np.ndarray:

@@ -34,8 +34,7 @@ def free_fall(motion: Motion) -> tuple[float, ...] | None:
     """
     if len(motion.index) < _LEAST_PARTICLES or len(motion.step) < 2 or not motion.spacing:
         return None
-    steps = motion.step[:_FIRST_STEPS]
-    path = motion.position[0] + np.concatenate([np.zeros_like(steps[:1]), np.cumsum(steps, axis=0)])
+    path = motion.position[0] + np.cumsum(np.insert(motion.step[:_FIRST_STEPS], 0, 0.0, axis=0), axis=0)
     gravity = find_gravity([Track(path, np.arange(len(path), dtype=np.float64))], motion.spacing, 1.0, closed=False)
     straight = gravity.value is not None and not any(gravity.value)
     return gravity.value if gravity.sure == "measured" or straight else None
