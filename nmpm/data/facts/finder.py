@@ -11,11 +11,12 @@ from nmpm.data.facts.boundaries import Axis, Ends, boundary_fact, bounds_fact, d
 from nmpm.data.facts.fact import Fact, Facts
 from nmpm.data.facts.free_fall import Track, find_gravity
 from nmpm.data.facts.obstacles import TypeMotion, path_extents, prescribed_fact
-from nmpm.data.facts.open_ends import Openings, unwrap
+from nmpm.data.facts.open_ends import unwrap
 from nmpm.data.facts.sample import Samples
 from nmpm.data.facts.timing import TimeSteps
 from nmpm.data.facts.volume import find_particle_volume
 from nmpm.data.format import Metadata, Split, Trajectory
+from nmpm.data.gravity import Gravity
 from nmpm.data.statistics import Extent
 from nmpm.errors import DataError
 from nmpm.scene import Boundary
@@ -67,12 +68,14 @@ class FactFinder:
         types, static = frozenset(self._extents), self._motion.static_fact()
         moving = types - static.value - self._obstacles or types - static.value
         volume = find_particle_volume(self._samples, moving)
-        prescribed = prescribed_fact(self._paths_by_type(moving), self._spacing(volume))
+        paths = {kind: self._paths(frozenset({kind})) for kind in moving}
+        prescribed = prescribed_fact(paths, self._spacing(volume))
         materials = moving - prescribed.value
         if prescribed.value:
             volume = find_particle_volume(self._samples, materials)
         spacing, dt = self._spacing(volume), self._times.fact(tuple(self._samples))
-        axes, openings = self._axes(materials, spacing)
+        beyond = self._extent(types - materials) if materials < types else None
+        axes, openings = find_axes(self._paths(materials), self._extent(materials), beyond, spacing)
         bounds, boundary = bounds_fact(axes, spacing), boundary_fact(axes, openings)
         solid = [axis.solid for axis in axes] if materials < types else None
         return Facts(
@@ -89,9 +92,8 @@ class FactFinder:
             unmoving=self._motion.unmoving(materials),
         )
 
-    def _paths_by_type(self, types: frozenset[int]) -> dict[int, list[np.ndarray]]:
-        paths = {kind: [sample.of(frozenset({kind})) for sample in self._samples] for kind in types}
-        return {kind: [each for each in positions if each.shape[1]] for kind, positions in paths.items()}
+    def _paths(self, types: frozenset[int]) -> list[np.ndarray]:
+        return [path for _, path in self._samples.paths(types)]
 
     def _spacing(self, volume: Fact[float | None]) -> float:
         """Typical distance of neighbours; where it is not known, a 64th of the longest side."""
@@ -106,18 +108,12 @@ class FactFinder:
         lower, upper = (np.stack([getattr(each, side) for each in extents]) for side in ("lower", "upper"))
         return lower.min(axis=0), upper.max(axis=0)
 
-    def _axes(self, materials: frozenset[int], spacing: float) -> tuple[tuple[Axis, ...], Openings]:
-        positions = [sample.of(materials) for sample in self._samples]
-        solid = frozenset(self._extents) - materials
-        beyond = self._extent(solid) if solid else None
-        return find_axes([each for each in positions if each.shape[1]], self._extent(materials), beyond, spacing)
-
     def _gravity(
-        self, axes: tuple[Axis, ...], materials: frozenset[int], spacing: float, dt: float
-    ) -> Fact[tuple[float, ...] | None]:
+        self, axes: Sequence[Axis], materials: frozenset[int], spacing: float, dt: float
+    ) -> Fact[Gravity | None]:
         periods = np.array([axis.period.length if axis.period else 0.0 for axis in axes])
-        positions = [(sample, sample.of(materials)) for sample in self._samples]
-        tracks = [Track(unwrap(each, periods), sample.times(dt)) for sample, each in positions if each.shape[1]]
+        paths = self._samples.paths(materials)
+        tracks = [Track(unwrap(path, periods), sample.times(dt)) for sample, path in paths]
         closed = bool((periods > 0).all()) and materials == frozenset(self._extents)
         return find_gravity(tracks, spacing, dt, closed)
 
@@ -137,9 +133,7 @@ def mean_spacing(low: np.ndarray, high: np.ndarray) -> float:
 def find_facts(split: Split, metadata: Metadata | None = None) -> Facts:
     """The facts in up to 128 MiB of positions of a split, in evenly spaced trajectories.
 
-    Args:
-        split: The trajectories.
-        metadata: States the time between frames, for gravity, and which types are obstacles; all else is found.
+    The metadata state the time between frames, for gravity, and which types are obstacles; all else is found.
 
     Raises:
         DataError: if a trajectory cannot be read, or no particle is ever there.

@@ -103,11 +103,10 @@ def prescribed_fact(positions: Mapping[int, Sequence[np.ndarray]], spacing: floa
     prescribed = frozenset(kind for kind in rigid if _has_program(positions[kind], others, spacing))
     free = ", ".join(map(str, sorted(rigid - prescribed)))
     names = ", ".join(map(str, sorted(prescribed)))
-    parts = [f"the particles of type {names} turn and shift as one, those of others do not"] if names else []
-    parts += (
-        [f"type {free} is rigid, and taken for free bodies: it falls, or differs between trajectories"] if free else []
-    )
-    return Fact(prescribed, f"{'; '.join(parts)}.", "likely")
+    programs = f"the particles of type {names} turn and shift as one, those of others do not"
+    bodies = f"type {free} is rigid, and taken for free bodies: it falls, or differs between trajectories"
+    how = "; ".join([programs] * bool(names) + [bodies] * bool(free))
+    return Fact(prescribed, f"{how}.", "likely")
 
 
 def _has_program(paths: Sequence[np.ndarray], others: Sequence[np.ndarray], spacing: float) -> bool:

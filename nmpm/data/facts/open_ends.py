@@ -112,10 +112,9 @@ class Openings:
 
 
 def find_openings(positions: Sequence[np.ndarray], low: np.ndarray, high: np.ndarray) -> Openings:
-    """The axes along which particles leave, in positions (F, N, D) of each trajectory, NaN where absent.
+    """The axes near whose ends tracks end, in positions (F, N, D) of each trajectory, NaN where absent.
 
-    A track that ends near an end of an axis left there; where most tracks end elsewhere, as in a measured volume,
-    particles come and go along all axes.
+    Where most tracks end elsewhere, as in a measured volume, particles come and go along all axes.
     """
     dim = len(low)
     last = np.concatenate([np.empty((0, dim)), *(_track_ends(each) for each in positions)])

@@ -117,5 +117,10 @@ class Samples:
         if len(self._kept) > _TRAJECTORIES:
             self._kept, self._stride = self._kept[::2], 2 * self._stride
 
+    def paths(self, types: frozenset[int]) -> list[tuple[Sample, np.ndarray]]:
+        """The samples in which particles of some types occur, and the positions (F, N, D) of these."""
+        paths = [(sample, sample.of(types)) for sample in self._kept]
+        return [(sample, path) for sample, path in paths if path.shape[1]]
+
     def __iter__(self) -> Iterator[Sample]:
         return iter(self._kept)

@@ -24,9 +24,7 @@ _CENTRED = 0.2  # of a ball's radius: mean offset of the particles in it, where 
 
 def find_particle_volume(samples: Iterable[Sample], materials: frozenset[int]) -> Fact[float | None]:
     """The volume of a particle in length ** dim, from first frames, or from last ones where particles settle."""
-    samples = tuple(samples)
-    first = [sample.first.of(materials) for sample in samples]
-    last = [sample.last.of(materials) for sample in samples]
+    first, last = zip(*((sample.first.of(materials), sample.last.of(materials)) for sample in samples), strict=True)
     nearest, dense = _medians(nearest_volume, first), _medians(density_volume, first)
     nearest_late, dense_late = _medians(nearest_volume, last), _medians(density_volume, last)
     if not nearest:
