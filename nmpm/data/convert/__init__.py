@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,7 +37,7 @@ from nmpm.data.convert.vtkhdf import VtkHdf
 from nmpm.data.convert.xyz import Xyz
 from nmpm.data.format import METADATA_FILE, Split, is_native, split_paths
 from nmpm.data.gravity import check_gravity
-from nmpm.errors import ConfigError, DataError
+from nmpm.errors import ConfigError, DataError, NmpmError
 
 _log = logging.getLogger(__name__)
 
@@ -83,8 +84,9 @@ def _find_format(path: Path, name: str | None) -> DatasetFormat:
     if not path.exists():
         raise DataError(f"{path}: no such file or folder.")
     for kind in FORMATS:
-        if kind.recognises(path):
-            return kind
+        with suppress(NmpmError, OSError):
+            if kind.recognises(path):
+                return kind
     raise DataError(describe_unknown(path))
 
 

@@ -26,7 +26,7 @@ from nmpm.data.convert.run_arrays import group_runs
 from nmpm.data.convert.run_files import Facts, Run, RunFiles
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
-from nmpm.errors import DataError, NmpmError
+from nmpm.errors import DataError
 
 
 class ArrayFiles(RunFiles):
@@ -37,11 +37,8 @@ class ArrayFiles(RunFiles):
     patterns: ClassVar[tuple[str, ...]] = ("*.npz", "*.npy", "*.h5", "*.hdf5")
 
     def recognises(self, path: Path) -> bool:
-        try:
-            first = next(iter(self.files(path).values()), ())
-            return bool(first) and bool(self.runs(first[0]))
-        except (NmpmError, OSError):
-            return False
+        first = next(iter(self.files(path).values()), ())
+        return bool(first) and bool(self.runs(first[0]))
 
     def files(self, path: Path) -> dict[str, tuple[Path, ...]]:
         if is_array_folder(path):
@@ -129,7 +126,7 @@ def _hdf5_arrays(file: Any, path: Path) -> Iterator[tuple[str, ArrayLike]]:
 
 
 class NpzArray:
-    """A member of an `.npz` file, of which slices are read; cheap where they are read in order.
+    """A member of an `.npz` file, read row by row; cheap where they are read in order.
 
     Args:
         archive: The open file.
@@ -149,12 +146,12 @@ class NpzArray:
             self.shape, self._fortran, self.dtype = read(self._file)
             self._start = self._file.tell()
 
-    def __getitem__(self, rows: int | slice | tuple[()]) -> np.ndarray:
+    def __getitem__(self, rows: int | tuple[()]) -> np.ndarray:
         if self.dtype.hasobject:
             raise DataError(f"{self._where}: holds Python objects, which are not unpickled. Save arrays of numbers.")
         if isinstance(rows, tuple):
             return self._read(0, math.prod(self.shape)).reshape(self.shape, order="F" if self._fortran else "C")
-        if self._fortran or isinstance(rows, slice):
+        if self._fortran:
             whole: np.ndarray = self[()][rows]
             return whole
         size = math.prod(self.shape[1:])

@@ -144,7 +144,7 @@ class DatasetFormat(abc.ABC):
 
     @abc.abstractmethod
     def recognises(self, path: Path) -> bool:
-        """Whether a file or folder looks like this format; cheap, raises nothing."""
+        """Whether a file or folder looks like this format; cheap, and errors mean no."""
 
     @abc.abstractmethod
     def open(self, path: Path, options: Options) -> ForeignDataset:

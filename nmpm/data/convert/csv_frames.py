@@ -10,9 +10,9 @@ import numpy as np
 
 from nmpm.data.convert.frame import ARRAY_NAMES, Frame
 from nmpm.data.convert.frame_files import FrameFormat
-from nmpm.data.convert.tables import Chunk, plain_column, read_chunks, read_columns
+from nmpm.data.convert.tables import Chunk, join_chunks, plain_column, read_chunks, read_columns
 from nmpm.data.convert.tracks import USUAL_COLUMNS, coordinate_columns
-from nmpm.errors import DataError, NmpmError
+from nmpm.errors import DataError
 
 _SAME_IN_FRAME = {*USUAL_COLUMNS["frame"], *USUAL_COLUMNS["time"]}
 
@@ -26,18 +26,14 @@ class CsvFrames(FrameFormat):
 
     def recognises(self, path: Path) -> bool:
         files = next(self._folders(path), (path, []))[1]
-        try:
-            return len(files) > 1 and all(map(_is_frame, files[:2]))
-        except (NmpmError, OSError):
-            return False
+        return len(files) > 1 and all(map(_is_frame, files[:2]))
 
     def frames(self, file: Path) -> Iterator[Frame]:
         names = read_columns(file)
         coordinates = coordinate_columns(names)
         if not coordinates:
             raise DataError(f"{file}: no columns x, y of coordinates (found: {', '.join(names[:12]) or 'no header'}).")
-        chunks = list(read_chunks(file, names))
-        table = {name: np.concatenate([chunk[name] for chunk in chunks]) if chunks else np.zeros(0) for name in names}
+        table = {name: np.zeros(0) for name in names} | join_chunks(list(read_chunks(file, names)))
         texts = [name for name in coordinates if table[name].dtype.kind != "f"]
         if texts:
             raise DataError(f"{file}: the column {texts[0]} must contain numbers.")

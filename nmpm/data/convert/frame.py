@@ -83,7 +83,9 @@ class Layout:
         """The layout of frames: an axis in which nothing has an extent is left out; ids differ in the first frame."""
         constant, first = flat_axes(frames), frames[0]
         axes = tuple(axis for axis in range(first.position.shape[1]) if axis not in constant)
-        id_name = _name_of(first.arrays, "id", _identities)
+        ids = {name: _integers(first.arrays[name]) for name in with_meaning("id", first.arrays)}
+        unique = (name for name, values in ids.items() if values is not None and len(np.unique(values)) == len(values))
+        id_name = next(unique, None)
         texts = ParticleArrays.of(first, axes, id_name).texts
         return cls(axes, constant, type_ids, id_name, (*first.left_out, *texts))
 
@@ -143,25 +145,16 @@ def _is_position(name: str, values: np.ndarray) -> bool:
     return plain_name(name) in (AXES if values.ndim == 1 else USUAL_NAMES["position"])
 
 
-def _name_of(
-    arrays: Mapping[str, np.ndarray], meaning: str, convert: Callable[[np.ndarray], np.ndarray | None]
-) -> str | None:
-    """The first array whose name has a meaning and that fits; None if there is none."""
-    return next((name for name in with_meaning(meaning, arrays) if convert(arrays[name]) is not None), None)
-
-
 def _take(
     arrays: dict[str, np.ndarray], meaning: str, convert: Callable[[np.ndarray], np.ndarray | None]
 ) -> np.ndarray | None:
     """Removes the first array whose name has a meaning and that fits, and returns it; None if there is none."""
-    name = _name_of(arrays, meaning, convert)
-    return None if name is None else convert(arrays.pop(name))
-
-
-def _identities(values: np.ndarray) -> np.ndarray | None:
-    """Integers of which none occurs twice."""
-    integers = _integers(values)
-    return integers if integers is not None and len(np.unique(integers)) == len(integers) else None
+    for name in with_meaning(meaning, arrays):
+        values = convert(arrays[name])
+        if values is not None:
+            del arrays[name]
+            return values
+    return None
 
 
 def _integers(values: np.ndarray) -> np.ndarray | None:

@@ -1,6 +1,6 @@
 """Meanings of arrays by their usual names and shapes: positions, types, velocities, masks, times, facts.
 
-Arrays are anything with `shape`, `dtype` and slices along the first axis, so that files are read run by run. T frames,
+Arrays are anything with `shape`, `dtype` and rows along the first axis, so that files are read run by run. T frames,
 N particles, D = 1 to 3 axes; R runs may be stacked in front.
 """
 
@@ -74,7 +74,7 @@ class ArrayLike(Protocol):
         """The kind of its numbers."""
 
     def __getitem__(self, rows: Any, /) -> Any:
-        """An index, slice or () of the first axis, as a NumPy array."""
+        """A row of the first axis, or all for (), as a NumPy array."""
 
 
 Arrays = Mapping[str, ArrayLike]

@@ -14,7 +14,7 @@ from typing import ClassVar
 from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, split_files
 from nmpm.data.described import DESCRIPTION, described_metadata
 from nmpm.data.format import METADATA_FILE, Metadata, Split, Trajectory, read_metadata, split_paths
-from nmpm.errors import DataError, NmpmError
+from nmpm.errors import DataError
 
 _PATTERNS = ("*.h5", "*.vtkhdf")
 
@@ -50,10 +50,7 @@ class NativeFiles(DatasetFormat):
 
     def recognises(self, path: Path) -> bool:
         files = split_files(path, *_PATTERNS)
-        try:
-            return bool(files) and bool(file_metadata(Split(next(iter(files.values()))[0]), None))
-        except (NmpmError, OSError):
-            return False
+        return bool(files) and bool(file_metadata(Split(next(iter(files.values()))[0]), None))
 
     def open(self, path: Path, options: Options) -> ForeignDataset:
         splits = {name: [Split(file) for file in files] for name, files in split_files(path, *_PATTERNS).items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -58,23 +59,19 @@ class RunArrays:
         object.__setattr__(self, "roles", find_roles(arrays, name))
 
     @property
-    def stacked(self) -> bool:
-        """Whether positions are (R, T, N, D)."""
-        return len(self._shape) == 4
+    def _shape(self) -> tuple[int, ...]:
+        """(T, N, D), or (R, T, N, D) where runs are stacked."""
+        return tuple(self.arrays[self.roles["position"]].shape)
 
     @property
     def count(self) -> int:
         """Number of runs."""
-        return self._shape[0] if self.stacked else 1
+        return math.prod(self._shape[:-3])
 
     @property
     def frames(self) -> int:
         """Number of frames of each run."""
         return self._shape[-3]
-
-    @property
-    def _shape(self) -> tuple[int, ...]:
-        return self.arrays[self.roles["position"]].shape
 
     @cached_property
     def field_names(self) -> tuple[str, ...]:
@@ -93,7 +90,7 @@ class RunArrays:
     def _per_run(self, array: ArrayLike) -> bool:
         """Whether the first axis of an array counts the runs."""
         shape = array.shape
-        if not self.stacked or not shape or shape[0] != self.count:
+        if not shape or shape[:1] != self._shape[:-3]:
             return False
         return not self._fits(shape) if len(shape) == 1 else self._fits(shape[1:])
 
@@ -157,7 +154,7 @@ class RunArrays:
         Raises:
             DataError: if arrays do not fit together, naming the file and run.
         """
-        where = f"{self.where}, run {run}" if self.stacked else self.where
+        where = f"{self.where}, run {run}" if self._shape[:-3] else self.where
         position = self._take(self.roles["position"], run).astype(np.float32)  # a copy, where absent becomes NaN
         types = self._types(run, position.shape[:2], metadata, where)
         check_axes(position, None if types is None else types.shape[-1], where)

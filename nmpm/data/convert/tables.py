@@ -63,6 +63,11 @@ def read_chunks(path: Path, columns: Sequence[str]) -> Iterator[Chunk]:
             before = lines.number
 
 
+def join_chunks(chunks: Sequence[Chunk]) -> dict[str, np.ndarray]:
+    """The columns of all chunks; none where there is no chunk."""
+    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in (chunks[0] if chunks else ())}
+
+
 @contextmanager
 def _progress(path: Path) -> Iterator[Callable[[int], object]]:
     """A function that shows how many bytes of a large text file are read."""

@@ -20,7 +20,7 @@ import numpy as np
 from nmpm._support.messages import counted
 from nmpm.data.convert.named_arrays import component_names, drop_axes, type_ids
 from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, FLAT, Facts, Run, RunFiles, placeholder_metadata
-from nmpm.data.convert.tables import SUFFIXES, Chunk, one_cell, plain_column, read_chunks, read_columns
+from nmpm.data.convert.tables import SUFFIXES, Chunk, join_chunks, one_cell, plain_column, read_chunks, read_columns
 from nmpm.data.convert.track_rows import TrackRows, frame_numbers
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.errors import DataError, NmpmError
@@ -128,7 +128,7 @@ class Tracks(RunFiles):
         wanted = (columns.key, *((columns.run,) if columns.run else ()))
         for index, chunks in enumerate(_split_runs(read_chunks(run.file, wanted), columns.run)):
             if index == run.index:
-                values = _join(chunks)[columns.key]
+                values = join_chunks(chunks)[columns.key]
                 return frame_numbers(values[~np.isnan(values)])[1] if values.dtype.kind == "f" else 0
         raise DataError(f"{run.file}: it has no run {run.index}.")
 
@@ -149,7 +149,7 @@ class Tracks(RunFiles):
         for index, chunks in enumerate(_split_runs(read_chunks(file, columns.names), columns.run)):
             where = f"{file}, run {index}" if columns.run else str(file)
             if index in set(indices):
-                yield track_rows(_join(chunks), columns, metadata, where, row).trajectory(where)
+                yield track_rows(join_chunks(chunks), columns, metadata, where, row).trajectory(where)
             if index == max(indices):
                 return
             row += sum(len(chunk[columns.key]) for chunk in chunks)
@@ -210,10 +210,6 @@ def _split_runs(chunks: Iterable[Chunk], column: str | None) -> Iterator[list[Ch
             pending.append({name: values[low:high] for name, values in chunk.items()})
     if pending:
         yield pending
-
-
-def _join(chunks: Sequence[Chunk]) -> Chunk:
-    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
 
 
 def _type_names(file: Path, column: str) -> list[str]:
