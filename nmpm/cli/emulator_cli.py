@@ -279,7 +279,7 @@ class EmulatorCLI(LightningCLI):
             self.model.load_state_dict(read_checkpoint(path)["state_dict"])
         untested = "" if self.trainer.limit_test_batches else "--trainer.limit_test_batches is 0."
         if not self.datamodule.has_test:
-            untested = f"{self.datamodule.data_source.folder} has no test.h5."
+            untested = f"{self.datamodule.data_source.description} has no test split."
         if untested:
             self.report.report_untested(self.trainer, self.model, untested)
         else:

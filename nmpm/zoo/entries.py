@@ -36,6 +36,8 @@ FILES = (CARD, CONFIG, WEIGHTS, *TABLES_AND_PICTURES)
 """All files of an entry; the tables and pictures may be missing."""
 BEST = Path("checkpoints") / "best.ckpt"
 """The best checkpoint within a run's folder."""
+LAST = BEST.with_name("last.ckpt")
+"""The last checkpoint, of runs without validation the only one."""
 WEIGHT_BYTES = 2**33
 INTEGER = 2**24
 """Largest integer in a model's recipe; some are exponents."""

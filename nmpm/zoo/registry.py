@@ -26,7 +26,7 @@ from nmpm._support.shipped import shipped_folder, user_zoo
 from nmpm.errors import ConfigError, ZooError
 from nmpm.zoo.card import CARD, stated_milliseconds
 from nmpm.zoo.choice import Limits, choose
-from nmpm.zoo.entries import BEST, load_checkpoint, load_entry, read_card
+from nmpm.zoo.entries import BEST, LAST, load_checkpoint, load_entry, read_card
 from nmpm.zoo.hub import HubId, download
 from nmpm.zoo.measures.speed import measure_speed
 from nmpm.zoo.pretrained import Pretrained
@@ -121,7 +121,7 @@ def load_model(model: str | Path, device: torch.device | str = "cpu", root: Root
 
     Args:
         model: One of `Zoo.list()`; or, if there is none of that name, the path of a zoo entry, of a run (of which the
-            best checkpoint is taken) or of a checkpoint; or "owner/repository@revision" of the Hugging Face hub.
+            best checkpoint is taken, without validation the last) or of a checkpoint; or "owner/repository@revision" of the Hugging Face hub.
             `./goop` is always a path.
         device: Where to compute: "cpu", "cuda", "mps", or "auto" for a GPU where there is one.
         root: Folder of a zoo, in which alone the name is looked up: with it, `model` cannot be a path.
@@ -138,8 +138,9 @@ def load_model(model: str | Path, device: torch.device | str = "cpu", root: Root
         return load_checkpoint(path).to(target)
     if (path / CARD).exists():
         return load_entry(path).to(target)
-    if (path / BEST).exists():
-        return load_checkpoint(path / BEST).to(target)
+    for checkpoint in (path / BEST, path / LAST):
+        if checkpoint.exists():
+            return load_checkpoint(checkpoint).to(target)
     raise ZooError(f"{path} holds no model: neither an entry of the zoo ({CARD}) nor a run ({BEST}).")
 
 

@@ -92,15 +92,16 @@ def test_without_validations_the_last_weights_are_tested(make_dataset):
     ended = json.loads(Path("run/report.json").read_text())["test"]
     assert main(["test", *words, "--ckpt_path", "last"]) == 0
     assert json.loads(Path("run/report.json").read_text())["test"] == ended
+    assert main(["rollout", "run", "--frames", "2", "--particles", "20"]) == 0
 
 
 def test_without_a_test_split_the_report_says_that_nothing_was_tested(make_dataset, capsys):
     folder = make_dataset(train=((40, 9),) * 2, valid=((40, 9),), test=())
     words = [*WATERDROP, "--data.path", str(folder), "--trainer.default_root_dir", "run"]
     assert main(["fit", *words]) == 0
-    assert f"Not tested: {folder} has no test.h5." in capsys.readouterr().out
+    assert f"Not tested: {folder.name} has no test split." in capsys.readouterr().out
     report = json.loads(Path("run/report.json").read_text())
-    assert report["not_tested"] == f"{folder} has no test.h5."
+    assert report["not_tested"] == f"{folder.name} has no test split."
     assert "test" not in report
     assert report["curve"]
     assert main(["test", *words, "--ckpt_path", "best"]) == 1
@@ -116,6 +117,7 @@ def test_the_test_that_ends_a_training_is_of_the_averaged_weights_of_the_best_ch
     ended = json.loads(Path("run/report.json").read_text())["test"]
     assert main(["test", *words, "--ckpt_path", "best"]) == 0
     assert json.loads(Path("run/report.json").read_text())["test"] == ended
+    assert main(["rollout", "run", "--frames", "2", "--particles", "20"]) == 0
 
 
 JUNK = r"Seed set|available: |[Tt]ip: |Restor|Loaded model|stopped: |Precision|LeafSpec|FLOPs|v_num|Epoch|sync_dist"

@@ -31,6 +31,7 @@ NOTES = "conversion"
 STATED = "stated_statistics"
 MOVING_BOUNDARIES = "moving_boundaries"
 _SAMPLE_BYTES = 2**28
+_PLAIN_TO_SEE: tuple[Any, ...] = (frozenset(), {0: "particles"})
 _MOVE_STATISTICS = {"bounds", "boundary", "particle_types", "static_types"}
 """Facts that displacements of moving particles depend on."""
 
@@ -112,7 +113,7 @@ class _Log:
         except DataError as error:
             if self.problems is None:
                 raise
-            self.problems.append(f"{error} Trajectories after it are not read.")
+            self.problems.append(f"{error} Trajectories after it are not read." if self.number else str(error))
 
     def _add(self, trajectory: Trajectory, where: str) -> None:
         types, position, metadata = trajectory.particle_type, trajectory.position, self.metadata
@@ -143,7 +144,7 @@ class _Log:
         self._facts = [
             f"{name} {_short(name, getattr(self.metadata, name))} ({how.rstrip('.')})."
             for name, how in self.metadata.extra[FOUND].items()
-            if getattr(self.metadata, name) != frozenset() and name != "sequence_length"
+            if getattr(self.metadata, name) not in _PLAIN_TO_SEE and name != "sequence_length"
         ]
         if facts.unmoving:
             first, count = facts.unmoving[0], sum(each.count for each in facts.unmoving)
