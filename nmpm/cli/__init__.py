@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
 
@@ -70,6 +72,17 @@ def usage() -> str:
     return USAGE.format(commands="\n".join(lines), configs=configs)
 
 
+@contextmanager
+def _plain_warnings() -> Iterator[None]:
+    """Shows warnings as a line each, without the line of code that they come from."""
+    before = warnings.formatwarning
+    warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; errors that a user can correct, those of the file system too, are printed without a traceback.
 
@@ -92,7 +105,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     try:
         command: Callable[[list[str]], int | None] = import_module(COMMANDS[words[0]][0]).run
-        return command(words) or 0
+        with _plain_warnings():
+            return command(words) or 0
     except NmpmError as error:
         sys.stderr.write(f"nmpm {words[0]}: {error}\n")
         return error.exit_status
