@@ -121,7 +121,8 @@ def load_model(model: str | Path, device: torch.device | str = "cpu", root: Root
 
     Args:
         model: One of `Zoo.list()`; or, if there is none of that name, the path of a zoo entry, of a run (of which the
-            best checkpoint is taken, without validation the last) or of a checkpoint; or "owner/repository@revision" of the Hugging Face hub.
+            best checkpoint is taken, without validation the last) or of a checkpoint; or "owner/repository@revision" of
+            the Hugging Face hub.
             `./goop` is always a path.
         device: Where to compute: "cpu", "cuda", "mps", or "auto" for a GPU where there is one.
         root: Folder of a zoo, in which alone the name is looked up: with it, `model` cannot be a path.
