@@ -14,8 +14,7 @@ from nmpm.data.inspection import comparisons
 from nmpm.data.inspection.findings import Finding
 from nmpm.data.inspection.irregular_motion import find_disorder, find_irregular_motion, find_noise
 from nmpm.data.inspection.motion import Motion, spacing_of
-from nmpm.data.inspection.particles import find_odd_particles
-from nmpm.data.inspection.stated import check_stated, free_fall
+from nmpm.data.inspection.stated import check_stated, find_odd_particles, free_fall
 from nmpm.data.statistics import Extent
 from nmpm.data.times import recorded_step
 from nmpm.errors import DataError
