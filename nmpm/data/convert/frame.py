@@ -30,25 +30,15 @@ ARRAY_NAMES = frozenset(
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame as its file has it.
+    """One frame as its file has it; None is what the file does not state."""
 
-    Args:
-        position: (N, D), NaN in all coordinates of particles that are not there.
-        arrays: (N,) or (N, k) by the names in the file: ids, types, velocities and any others.
-        time: In the file's unit; None where the file does not state it.
-        step: Number of the simulator's step; None where the file does not state it.
-        box: (lower, upper) per axis, of the simulator; None where the file does not state it.
-        boundary: Of the box, per axis.
-        left_out: Names of what else is in the file.
-    """
-
-    position: np.ndarray
-    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
-    time: float | None = None
-    step: int | None = None
-    box: tuple[Interval, ...] | None = None
-    boundary: tuple[Boundary, ...] | None = None
-    left_out: tuple[str, ...] = ()
+    position: np.ndarray  # (N, D), NaN in all coordinates of particles that are not there
+    arrays: Mapping[str, np.ndarray] = field(default_factory=dict)  # (N,) or (N, k) by the names in the file
+    time: float | None = None  # in the file's unit
+    step: int | None = None  # number of the simulator's step
+    box: tuple[Interval, ...] | None = None  # (lower, upper) per axis, of the simulator
+    boundary: tuple[Boundary, ...] | None = None  # of the box, per axis
+    left_out: tuple[str, ...] = ()  # names of what else is in the file
 
 
 def flat_axes(frames: Sequence[Frame]) -> dict[int, float]:
@@ -62,21 +52,13 @@ def flat_axes(frames: Sequence[Frame]) -> dict[int, float]:
 
 @dataclass(frozen=True)
 class Layout:
-    """What the first frames tell about all.
+    """What the first frames tell about all."""
 
-    Args:
-        axes: The axes of the files that are kept.
-        constant: Values of the axes that are left out, which are the same for all particles.
-        type_ids: Type ids by the names in the files, where types have names.
-        id_name: The array of the particles' ids; None if there is none.
-        left_out: Names of what else is in the files.
-    """
-
-    axes: tuple[int, ...]
-    constant: Mapping[int, float]
-    type_ids: Mapping[str, int]
-    id_name: str | None
-    left_out: tuple[str, ...]
+    axes: tuple[int, ...]  # those of the files that are kept
+    constant: Mapping[int, float]  # values of the axes that are left out, the same for all particles
+    type_ids: Mapping[str, int]  # by the names in the files, where types have names
+    id_name: str | None  # the array of the particles' ids
+    left_out: tuple[str, ...]  # names of what else is in the files
 
     @classmethod
     def of(cls, frames: Sequence[Frame], type_ids: Mapping[str, int]) -> Layout:

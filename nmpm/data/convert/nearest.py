@@ -107,7 +107,6 @@ def _wrong_positions(arrays: Arrays) -> str | None:
 
 def _table_problem(file: Path) -> str:
     try:
-        table_columns(file)
+        return f"{file}: a table with the columns {', '.join(table_columns(file).names)}."
     except NmpmError as error:
         return f"{error} A table of tracks has a row for each particle in each frame: frame or time, id, x, y."
-    return f"{file}: a table."

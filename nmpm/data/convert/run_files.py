@@ -38,21 +38,13 @@ def placeholder_metadata(dim: int, **facts: Any) -> Metadata:
 
 @dataclass(frozen=True)
 class Run:
-    """A run in a file.
-
-    Args:
-        file: Where it is.
-        index: Which of the file's runs it is.
-        frames: Number of frames; 0 where they are not counted.
-        split: Name of the split, where names in the file state one.
-        part: Frames to take; all when left out.
-    """
+    """A run in a file."""
 
     file: Path
-    index: int
-    frames: int = 0
-    split: str | None = None
-    part: range | None = None
+    index: int  # which of the file's runs it is
+    frames: int = 0  # 0 where they are not counted
+    split: str | None = None  # where names in the file state one
+    part: range | None = None  # frames to take; None for all
 
     def take(self, trajectory: Trajectory) -> Trajectory:
         """The part of its whole trajectory."""

@@ -19,27 +19,16 @@ _SPARSE = 4  # entries of (T, ids) arrays per row, beyond which tracks share slo
 
 @dataclass(frozen=True)
 class TrackRows:
-    """Rows of one run: a position of a track in a frame each.
+    """Rows of one run: a position of a track in a frame each."""
 
-    Args:
-        row: (n,) numbers of the rows in the table, for messages.
-        position: (n, D).
-        track: (n,) ids, numbers or texts.
-        key: (n,) frame numbers, or times where there are none.
-        time: (n,) times; None where there are none.
-        types: (n,) type ids; None where there is one type.
-        values: (n,) other numbers by name.
-        velocity: (n, D); None where there are none.
-    """
-
-    row: np.ndarray
-    position: np.ndarray
-    track: np.ndarray
-    key: np.ndarray
-    time: np.ndarray | None
-    types: np.ndarray | None
-    values: Mapping[str, np.ndarray]
-    velocity: np.ndarray | None
+    row: np.ndarray  # (n,) numbers of the rows in the table, for messages
+    position: np.ndarray  # (n, D)
+    track: np.ndarray  # (n,) ids, numbers or texts
+    key: np.ndarray  # (n,) frame numbers, or times where there are none
+    time: np.ndarray | None  # (n,)
+    types: np.ndarray  # (n,) type ids
+    values: Mapping[str, np.ndarray]  # (n,) other numbers by name
+    velocity: np.ndarray | None  # (n, D)
 
     def trajectory(self, where: str) -> Trajectory:
         """The run with a particle for each track, or slots that hold one track after the other.
@@ -60,18 +49,21 @@ class TrackRows:
         if shared:
             slot_of = assign_slots(track, frame_of, types)
         slot, count = slot_of[track], int(slot_of.max()) + 1
-        position = np.full((frames, count, self.position.shape[1]), np.nan, np.float32)
-        position[frame_of, slot] = self.position
+
+        def placed(values: np.ndarray, absent: float = np.nan, dtype: type = np.float32) -> np.ndarray:
+            array = np.full((frames, count, *values.shape[1:]), absent, dtype)
+            array[frame_of, slot] = values
+            return array
+
         kinds = np.zeros(count, np.int64)
         kinds[slot_of] = types
+        position = placed(self.position)
         present = ~np.isnan(position[..., 0])
-        fields = {name: _filled(values, frame_of, slot, present) for name, values in self.values.items()}
+        fields = {name: _filled(placed(values), present) for name, values in self.values.items()}
         if shared:
-            fields[TRACK] = np.full((frames, count), -1, np.int32)
-            fields[TRACK][frame_of, slot] = track
+            fields[TRACK] = placed(track, -1, np.int32)
         if self.velocity is not None:
-            fields["velocity"] = np.full_like(position, np.nan)
-            fields["velocity"][frame_of, slot] = self.velocity
+            fields["velocity"] = placed(self.velocity)
         if self.time is not None:
             with_rows, first = np.unique(frame_of, return_index=True)
             fields["time"] = np.interp(np.arange(frames), with_rows, self.time[first])
@@ -92,8 +84,6 @@ class TrackRows:
     def _types_of_tracks(self, track: np.ndarray, where: str) -> np.ndarray:
         """(tracks,) type ids."""
         types = np.zeros(int(track.max()) + 1, np.int64)
-        if self.types is None:
-            return types
         types[track] = self.types
         changes = types[track] != self.types
         if changes.any():
@@ -140,11 +130,8 @@ def assign_slots(track: np.ndarray, frame_of: np.ndarray, types: np.ndarray) -> 
     return slots
 
 
-def _filled(values: np.ndarray, frame_of: np.ndarray, slot: np.ndarray, present: np.ndarray) -> np.ndarray:
+def _filled(field: np.ndarray, present: np.ndarray) -> np.ndarray:
     """(T, N) values, or (N,) constant ones, of which absent particles have the one before or else after."""
-    frames, count = present.shape
-    field = np.zeros((frames, count), np.float32)
-    field[frame_of, slot] = values
-    last = np.maximum.accumulate(np.where(present, np.arange(frames)[:, None], -1), axis=0)
+    last = np.maximum.accumulate(np.where(present, np.arange(len(present))[:, None], -1), axis=0)
     field = np.take_along_axis(field, np.where(last < 0, present.argmax(axis=0), last), axis=0)
     return field[0] if (field == field[0]).all() else field

@@ -177,18 +177,19 @@ def track_rows(table: Chunk, columns: Columns, metadata: Metadata, where: str, f
         _log.warning("%s: %s without %s left out.", where, counted(int(unlinked.sum()), "row"), columns.track)
     if not keep.any():
         raise DataError(f"{where}: no row has an id, a frame and a position.")
-    types, velocity = None if columns.types is None else table[columns.types], columns.velocity[: metadata.dim]
-    if types is not None and types.dtype.kind == "f":
+    types = table[columns.types] if columns.types else np.zeros(len(track))
+    if types.dtype.kind == "f":
         types = np.nan_to_num(types).astype(np.int64)
-    elif types is not None:
+    else:
         types = type_ids(types, {name: i for i, name in metadata.particle_types.items()}, where)
+    velocity = columns.velocity[: metadata.dim]
     return TrackRows(
         first_row + np.flatnonzero(keep),
         position[keep],
         track[keep],
         key[keep],
         None if time is None else time[keep],
-        None if types is None else types[keep],
+        types[keep],
         {name: table[name][keep] for name in columns.others if table[name].dtype.kind == "f"},
         np.stack([table[name][keep] for name in velocity], axis=-1) if velocity else None,
     )
