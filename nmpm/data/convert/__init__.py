@@ -83,6 +83,8 @@ def _find_format(path: Path, name: str | None) -> DatasetFormat:
         raise ConfigError(f"No format is called {name!r}; known: {names}.")
     if not path.exists():
         raise DataError(f"{path}: no such file or folder.")
+    if path.is_file() and not path.stat().st_size:
+        raise DataError(f"{path}: the file is empty. Copy, download or write it again.")
     for kind in FORMATS:
         with suppress(NmpmError, OSError):
             if kind.recognises(path):

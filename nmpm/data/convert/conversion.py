@@ -75,6 +75,8 @@ def _write(source: ForeignDataset, folder: Path, problems: list[str] | None) -> 
             log.statistics = log.statistics or log.motion.result()
     if problems and not log.number:
         raise DataError(problems[0])
+    if log.frames == {1}:
+        raise DataError(f"{names[0]} split: its trajectories have one frame each; motion needs two or more.")
     if source.unknown:
         log.find_unknown(Split(folder / f"{names[0]}.h5"))
     metadata, notes = log.final_metadata()

@@ -60,3 +60,17 @@ def test_files_that_are_called_like_splits_need_not_be_native(tmp_path):
             file["positions"] = RUN
     folder = native_folder(tmp_path)
     assert sorted(path.name for path in folder.glob("*.h5")) == ["train.h5", "valid.h5"]
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".csv", ".vtk", ".xyz", ".lammpstrj", ".h5"])
+def test_an_empty_file_is_called_empty(tmp_path, suffix):
+    (tmp_path / f"run{suffix}").touch()
+    with pytest.raises(DataError, match=rf"run{suffix}: the file is empty\."):
+        open_dataset(tmp_path / f"run{suffix}")
+
+
+@pytest.mark.usefixtures("home")
+def test_trajectories_of_a_frame_each_are_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", positions=RUN[:, :1])
+    with pytest.raises(DataError, match="its trajectories have one frame each"):
+        native_folder(tmp_path / "a.npz")
