@@ -62,19 +62,19 @@ def check_times(motion: Motion) -> Iterator[Finding]:
     dt = recorded_step(motion.trajectory)
     if dt is None:
         return
-    steps = np.diff(np.asarray(motion.trajectory.fields["time"], dtype=np.float64))
-    off = np.abs(steps / dt - 1)
-    if uneven_step(motion.trajectory.fields["time"]) is not None:
-        frame = int(np.argmax(off))
+    time = np.asarray(motion.trajectory.fields["time"], dtype=np.float64)
+    if (uneven := uneven_step(time)) is not None:
+        frame, factor = uneven
+        differing = int((np.abs(np.diff(time) / dt - 1) > _UNEVEN).sum())
         yield Finding(
             "uneven time steps",
             Severity.CONTRADICTION,
-            f"it comes {steps[frame] / dt:.3g} time steps of {dt:.4g} after the one before;"
-            f" {int((off > _UNEVEN).sum())} of {len(steps)} steps differ.",
+            f"it comes {factor:.3g} time steps of {dt:.4g} after the one before; {differing} of {len(time) - 1} steps"
+            " differ.",
             motion.where,
-            f"frame {frame + 1}",
-            float(steps[frame] / dt),
-            badness=float(off.max()),
+            f"frame {frame}",
+            factor,
+            badness=abs(factor - 1),
         )
     factor = motion.metadata.dt / dt
     if abs(factor - 1) > _UNEVEN:
