@@ -18,6 +18,7 @@ from nmpm._support.bounded_files import EXPANSION, check_regular, expansion_limi
 from nmpm.data.convert.base import readable
 
 _LINE_BYTES = 2**20
+_BUFFER_BYTES = 2**16
 
 
 class Lines:
@@ -102,7 +103,7 @@ def open_lines(path: Path, kind: str) -> Iterator[Lines]:
     with (
         readable(path, kind, zlib.error, csv.Error),
         # The buffer reads lines several times faster than GzipFile.
-        io.BufferedReader(gzip.GzipFile(path), _LINE_BYTES) if packed else path.open("rb") as file,
+        io.BufferedReader(gzip.GzipFile(path), _BUFFER_BYTES) if packed else path.open("rb") as file,
     ):
         yield Lines(file, expansion_limit(size) if packed else 2 * size + 1)
 
