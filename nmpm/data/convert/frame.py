@@ -56,12 +56,11 @@ class Layout:
 
     axes: tuple[int, ...]  # those of the files that are kept
     constant: Mapping[int, float]  # values of the axes that are left out, the same for all particles
-    type_ids: Mapping[str, int]  # by the names in the files, where types have names
     id_name: str | None  # the array of the particles' ids
     left_out: tuple[str, ...]  # names of what else is in the files
 
     @classmethod
-    def of(cls, frames: Sequence[Frame], type_ids: Mapping[str, int]) -> Layout:
+    def of(cls, frames: Sequence[Frame]) -> Layout:
         """The layout of frames: an axis in which nothing has an extent is left out; ids differ in the first frame."""
         constant, first = flat_axes(frames), frames[0]
         axes = tuple(axis for axis in range(first.position.shape[1]) if axis not in constant)
@@ -69,7 +68,7 @@ class Layout:
         unique = (name for name, values in ids.items() if values is not None and len(np.unique(values)) == len(values))
         id_name = next(unique, None)
         texts = ParticleArrays.of(first, axes, id_name).texts
-        return cls(axes, constant, type_ids, id_name, (*first.left_out, *texts))
+        return cls(axes, constant, id_name, (*first.left_out, *texts))
 
     def notes(self) -> tuple[str, ...]:
         """For the user."""

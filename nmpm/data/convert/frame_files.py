@@ -88,12 +88,12 @@ class FrameFormat(DatasetFormat):
         runs, gaps = self._runs(path)
         run = next((run for split in SPLITS for run in runs if run.split == split), runs[0])
         first = self._first_frames(run)
-        layout = Layout.of(first, self._type_ids(first, runs))
+        layout, type_ids = Layout.of(first), self._type_ids(first, runs)
         stated = {"bounds": first[0].box, "boundary": first[0].boundary}
         facts = {
             name: tuple(value[axis] for axis in layout.axes) for name, value in stated.items() if value is not None
         }
-        names = {number: name for name, number in layout.type_ids.items()}
+        names = {number: name for name, number in type_ids.items()}
         metadata = placeholder_metadata(len(layout.axes), particle_types=names, **facts)
         notes = (*layout.notes(), *gaps, *self.notes(first, options))
         read = partial(self._read_all, layout=layout)
@@ -171,11 +171,10 @@ class FrameFormat(DatasetFormat):
         return named if len(set(named.values())) == len(named) else {}
 
     def _read_all(self, runs: Sequence[FrameRun], metadata: Metadata, layout: Layout) -> Iterator[Trajectory]:
-        stated = {name: number for number, name in metadata.particle_types.items()}
-        layout = replace(layout, type_ids=stated | dict(layout.type_ids))
+        ids = {name: number for number, name in metadata.particle_types.items()}
         for run in runs:
             total = (run.frames if run.part is None else len(run.part)) or None
-            stack = FrameStack(layout, total)
+            stack = FrameStack(layout, ids, total)
             with progress_bar(f"Reading {run.file.name}", total) as advance:
                 for frame, where in self._frames_of(run):
                     stack.add(frame, where)

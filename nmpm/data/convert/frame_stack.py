@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -26,11 +27,12 @@ class FrameStack:
 
     Args:
         layout: Of the frames.
+        type_ids: By name.
         frames: Number of frames, None where it is unknown.
     """
 
-    def __init__(self, layout: Layout, frames: int | None = None) -> None:
-        self._axes, self._constant, self._type_ids = list(layout.axes), layout.constant, layout.type_ids
+    def __init__(self, layout: Layout, type_ids: Mapping[str, int], frames: int | None = None) -> None:
+        self._axes, self._constant, self._type_ids = list(layout.axes), layout.constant, type_ids
         self._id_name = layout.id_name
         self._frames, self._count = frames or _FRAMES, 0
         self._values: dict[str, np.ndarray] = {}  # (frames, particles, …), with room for more

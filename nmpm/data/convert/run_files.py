@@ -115,8 +115,12 @@ def open_divided(
     read: Callable[[Sequence[SomeRun], Metadata], Iterator[Trajectory]],
     options: Options,
 ) -> ForeignDataset:
-    """The dataset of runs by split, of which those of the split "all" are divided by `divide`."""
-    metadata, unknown, notes = facts
+    """The dataset of runs by split, of which those of the split "all" are divided by `divide`.
+
+    `read` gets metadata with the names of types that are in the files, also where the user gives other names.
+    """
+    stated, unknown, notes = facts
+    metadata = stated
     if options.family is not None:
         family = find_family(options.family)
         names, static, prescribed = dict(family.types), family.static, family.prescribed
@@ -124,9 +128,10 @@ def open_divided(
         unknown -= {"particle_types", "static_types"}
     metadata, undivided = options.apply_to(metadata), runs.get("all")
     splits, divided = divide(undivided) if undivided else (runs, ())
+    in_files = replace(metadata, particle_types={**metadata.particle_types, **stated.particle_types})
 
     def dataset(splits: Mapping[str, Sequence[SomeRun]], notes: tuple[str, ...]) -> ForeignDataset:
-        readers = {split: partial(read, each, metadata) for split, each in splits.items()}
+        readers = {split: partial(read, each, in_files) for split, each in splits.items()}
         counts = {split: len(each) for split, each in splits.items()}
         return ForeignDataset(metadata, readers, notes, counts, unknown=unknown - options.stated)
 

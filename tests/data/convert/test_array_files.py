@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from nmpm.data.convert import convert, open_dataset
+from nmpm.data.convert import Options, convert, open_dataset
 from nmpm.data.format import Split, read_metadata
 from nmpm.errors import DataError
 
@@ -171,6 +171,9 @@ def test_components_and_names_of_types_are_joined(tmp_path):
     np.testing.assert_array_equal(run.fields["velocity"], 2 * position)
     types = open_dataset(tmp_path / "xy.npz").metadata.particle_types
     assert [types[i] for i in run.particle_type.tolist()] == names.tolist()
+    renamed = open_dataset(tmp_path / "xy.npz", options=Options(types={0: "mud"}))
+    assert renamed.metadata.particle_types == {0: "mud", 1: "sand"}
+    np.testing.assert_array_equal(next(renamed.splits["train"]()).particle_type, run.particle_type)
 
 
 def test_facts_beside_the_arrays_are_taken(tmp_path):
