@@ -30,7 +30,7 @@ SMALLER = {
     "range(20)": "range(3)",
 }
 LAUNCHERS = ("srun", "torchrun")
-RECORDED = ("FOLDER", "channel", "goop2", "goop-as-in-the-paper")
+RECORDED = ("DATA", "FOLDER", "channel", "goop2", "goop-as-in-the-paper")
 TRAINING = ("fit", "validate", "test", "predict")
 
 

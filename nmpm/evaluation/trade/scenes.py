@@ -18,6 +18,7 @@ from nmpm.data.format import Split, find_split, read_metadata
 from nmpm.data.generate import generate
 from nmpm.data.loading.padded_batch import collate, displacements
 from nmpm.data.loading.recording import Recording, SplitRecordings
+from nmpm.data.loading.sources import FolderSource
 from nmpm.data.scene_inference import infer_scene
 from nmpm.data.simulation import SimulationRequest
 from nmpm.errors import ConfigError, DataError
@@ -92,7 +93,7 @@ class Scenes:
 
 
 def find_scenes(dataset: str, count: int) -> Scenes:
-    """Test scenes of an embedded dataset or a folder in native layout, `count` at most; simulated if missing.
+    """Test scenes of an embedded dataset or of data of any format that is read, `count` at most; simulated if missing.
 
     Raises:
         ConfigError: if there is no such dataset.
@@ -101,12 +102,12 @@ def find_scenes(dataset: str, count: int) -> Scenes:
     if dataset in catalog():
         folder = find_simulated(dataset, count) or ensure(dataset, {"train": 0, "valid": 0, "test": count})
         return read_scenes(dataset, folder, count)
-    if not Path(dataset).is_dir():
+    if not Path(dataset).exists():
         raise ConfigError(
-            f"{dataset} is neither a folder nor an embedded dataset: {', '.join(catalog())}."
+            f"{dataset} is neither a file or folder nor an embedded dataset: {', '.join(catalog())}."
             f"{suggestion(dataset, catalog())}"
         )
-    return read_scenes(Path(dataset).name, Path(dataset), count)
+    return read_scenes(Path(dataset).name, FolderSource(Path(dataset)).folder, count)
 
 
 def find_wider_scenes(dataset: str, count: int, times: int) -> Scenes:
