@@ -159,8 +159,7 @@ class TrainingStep:
         self.setup, self.unroll = setup, options["unroll"]
         steps = torch.arange(2 + FRAMES * self.unroll).sub(1).view(1, -1, 1, 1)
         frames = state.position.unsqueeze(1) + steps * state.velocity.unsqueeze(1)
-        others = {name: value for name, value in vars(state).items() if name not in ("position", "velocity")}
-        window = Window(frames=frames, **others)
+        window = dataclasses.replace(Window.of(state), frames=frames)
         emulator = build_emulator(setup, scene, options["width"], options.get("cells", CELLS))
         calibrate(emulator, [window])
         self.window, self.emulator = window.to(device), emulator.to(device)
