@@ -14,7 +14,8 @@ from nmpm.data.array_checks import check_axes, check_end
 from nmpm.data.convert.base import make_options
 from nmpm.data.convert.conversion import write_native
 from nmpm.data.convert.runs_in_memory import Runs, open_runs
-from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Trajectory, read_metadata, write_metadata, write_split
+from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata, write_metadata, write_split
+from nmpm.data.metadata import scene_metadata
 from nmpm.data.statistics import first_outside
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
@@ -118,23 +119,3 @@ def _from_bare_array(position: np.ndarray, kinds: int, where: str) -> Trajectory
 
 def _types(scene: Scene) -> dict[int, str]:
     return dict(enumerate(scene.materials + ((STATIC_NAME,) if scene.obstacles else ())))
-
-
-def scene_metadata(scene: Scene, types: dict[int, str], static_type: int | None) -> Metadata:
-    """The metadata of trajectories of a scene whose type ids have these names; their length is still to be set."""
-    obstacle = frozenset() if static_type is None else frozenset({static_type})
-    return Metadata(
-        bounds=scene.bounds,
-        dt=scene.dt,
-        dim=scene.dim,
-        sequence_length=1,
-        particle_types=types,
-        static_types=obstacle,
-        prescribed_types=obstacle if scene.moving_obstacles else frozenset(),
-        boundary=scene.boundary,
-        domain=scene.domain,
-        gravity=scene.gravity,
-        particle_volume=scene.particle_volume,
-        densities=dict(zip(scene.materials, scene.densities, strict=True)) if scene.densities else {},
-        fields=scene.fields,
-    )

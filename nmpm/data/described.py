@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.metadata import scene_metadata
 from nmpm.data.metadata_json import JsonKeys, parse_ids, parse_json, parse_names
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
@@ -69,17 +71,10 @@ def read_description(
 def described_metadata(attributes: Mapping[str, Any], path: Path, frames: int) -> Metadata:
     """The metadata of a dataset of trajectories with this description, of so many frames; see `read_description`."""
     scene, names, static, prescribed = read_description(attributes, path)
-    return Metadata(
-        bounds=scene.bounds,
-        dt=scene.dt,
-        dim=scene.dim,
+    return replace(
+        scene_metadata(scene, names, None),
         sequence_length=frames - 1,
-        particle_types=names,
         static_types=static,
         prescribed_types=prescribed,
-        boundary=scene.boundary,
-        domain=scene.domain,
-        gravity=scene.gravity,
-        particle_volume=scene.particle_volume,
-        densities=dict(zip(scene.materials, scene.densities, strict=True)) if scene.densities else {},
+        fields=(),  # a description declares no inputs of models
     )

@@ -25,7 +25,6 @@ from nmpm._support.bounded_files import NPZ_ERRORS
 from nmpm._support.progress import progress_bar
 from nmpm._support.threads import usable_cores
 from nmpm._support.version import __version__
-from nmpm.data.arrays import scene_metadata
 from nmpm.data.format import (
     METADATA_FILE,
     SPLITS,
@@ -36,6 +35,7 @@ from nmpm.data.format import (
     write_metadata,
     write_split,
 )
+from nmpm.data.metadata import scene_metadata
 from nmpm.data.simulation import DRAWS, Shard, SimulationRequest, seed_of_draw, simulate_all
 from nmpm.data.statistics import MotionStatistics
 from nmpm.errors import DataError

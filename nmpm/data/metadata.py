@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from nmpm.errors import ConfigError, DataError
-from nmpm.scene import Boundary, Interval
+from nmpm.scene import Boundary, Interval, Scene
 
 METADATA_FILE = "metadata.json"
 PADDING = "padding"
@@ -127,3 +127,23 @@ class Metadata:
                 f" (--types {unknown[0]}=sand), or choose another family"
                 f" ({', '.join(sorted(FAMILIES))})."
             )
+
+
+def scene_metadata(scene: Scene, types: dict[int, str], static_type: int | None) -> Metadata:
+    """The metadata of trajectories of a scene whose type ids have these names; their length is still to be set."""
+    obstacle = frozenset() if static_type is None else frozenset({static_type})
+    return Metadata(
+        bounds=scene.bounds,
+        dt=scene.dt,
+        dim=scene.dim,
+        sequence_length=1,
+        particle_types=types,
+        static_types=obstacle,
+        prescribed_types=obstacle if scene.moving_obstacles else frozenset(),
+        boundary=scene.boundary,
+        domain=scene.domain,
+        gravity=scene.gravity,
+        particle_volume=scene.particle_volume,
+        densities=dict(zip(scene.materials, scene.densities, strict=True)) if scene.densities else {},
+        fields=scene.fields,
+    )

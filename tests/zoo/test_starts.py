@@ -7,8 +7,8 @@ import pytest
 import torch
 from scenes import box
 
-from nmpm.data.arrays import scene_metadata
 from nmpm.data.format import Trajectory
+from nmpm.data.metadata import scene_metadata
 from nmpm.errors import ConfigError, DataError
 from tests.zoo.test_states import model_of
 
