@@ -110,6 +110,8 @@ class Window(Batched):
         present: (B, T, N) bool, whether each particle is there in each frame; None where all of `mask` always are.
         obstacle_frames: (B, T, M, D) positions of obstacles in each frame; None where no obstacle moves. `obstacle`
             has those of the second frame.
+        observed: (B, T) bool, whether each frame was recorded; the others are interpolated and count in no error. None
+            where all were. The second frame always was.
 
     Raises:
         ValueError: if the shapes do not fit together.
@@ -126,6 +128,7 @@ class Window(Batched):
     present: Tensor | None = None
     obstacle_frames: Tensor | None = None
     volume: Tensor | None = None
+    observed: Tensor | None = None
 
     def __post_init__(self) -> None:
         batch, frames, count, dim = self.frames.shape
@@ -136,6 +139,8 @@ class Window(Batched):
             _check_shape("Window.present", self.present, [(batch, frames, count)])
         if self.obstacle_frames is not None:
             _check_shape("Window.obstacle_frames", self.obstacle_frames, [(batch, frames, *self.obstacle.shape[1:])])
+        if self.observed is not None:
+            _check_shape("Window.observed", self.observed, [(batch, frames)])
 
     @classmethod
     def of(cls, state: Particles) -> Self:
@@ -185,6 +190,7 @@ class Window(Batched):
             "frames": self.frames,
             "present": self.present,
             "obstacle_frames": self.obstacle_frames,
+            "observed": self.observed,
         }
         cut: dict[str, Any] = {name: values[:, :frames] for name, values in timed.items() if values is not None}
         cut["fields"] = {name: values[:, :frames] for name, values in self.fields.items()}

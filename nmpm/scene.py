@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, Self, get_args
 
 from nmpm._support.plain_data import from_plain, to_plain
@@ -231,6 +231,30 @@ class Scene:
             ConfigError: if a key is unknown, missing, or of the wrong kind.
         """
         return from_plain(cls, plain, "Scene")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a dataset is read for a model: as a scene of the model's materials, at the model's frames.
+
+    Args:
+        scene: The dataset's in its own units, but with the model's materials, and the `dt` of the model's frames.
+        materials: The model's material by the dataset's name, of those that differ.
+        every: Frames of the dataset per frame of the model; those between are skipped.
+        between: Frames of the model per frame of the dataset; those that the dataset lacks count in no error.
+
+    Raises:
+        ConfigError: if a stride is not positive, or both are above 1.
+    """
+
+    scene: Scene
+    materials: Mapping[str, str] = field(default_factory=dict)
+    every: int = 1
+    between: int = 1
+
+    def __post_init__(self) -> None:
+        if min(self.every, self.between) < 1 or max(self.every, self.between) > 1 < min(self.every, self.between):
+            raise ConfigError(f"every = {self.every}, between = {self.between}: one is 1, the other 1 or more.")
 
 
 def check_field_names(names: Iterable[str]) -> None:
