@@ -204,6 +204,7 @@ class EmulatorCLI(LightningCLI):
             initial = load_model(str(config["start_from"])).emulator.over(emulator.scene)
             check_same_recipe(initial.recipe.to_dict(), emulator.recipe)
             emulator.load_state_dict(initial.state_dict())
+            self._saver(BestCheckpoint).scores_start = True
         if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
             return
         self.locks.append(self.run_folder.lock())
@@ -276,7 +277,10 @@ class EmulatorCLI(LightningCLI):
         # Not by `ckpt_path`, from which a WeightAveraging callback that has just trained takes the raw weights.
         path = Path(best.best_model_path or self.run_folder.checkpoints["last"])
         if path.is_file():
-            self.model.load_state_dict(read_checkpoint(path)["state_dict"])
+            content = read_checkpoint(path)
+            self.model.load_state_dict(content["state_dict"])
+            if best.best_model_path and best.start_score is not None:
+                self.report.progress = best.describe_progress(content["global_step"], self.trainer.global_step)
         untested = "" if self.trainer.limit_test_batches else "--trainer.limit_test_batches is 0."
         if not self.datamodule.has_test:
             untested = f"{self.datamodule.data_source.description} has no test split."

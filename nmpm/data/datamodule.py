@@ -9,15 +9,16 @@ from typing import Any
 import torch
 from lightning.pytorch import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
+from lightning.pytorch.utilities import rank_zero_info
 
 from nmpm.data.convert import Options
-from nmpm.data.format import split_paths
+from nmpm.data.format import find_split, split_paths, split_renames
 from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.padded_batch import pin_for
-from nmpm.data.loading.sources import SourceName, make_source
+from nmpm.data.loading.sources import HoldOut, SourceName, make_source
 from nmpm.data.loading.window_plan import PlanStart, WindowPlan
-from nmpm.errors import ConfigError, DataError
+from nmpm.errors import ConfigError
 from nmpm.particles import Window
 from nmpm.scene import Boundary, Scene
 
@@ -153,7 +154,7 @@ class TrajectoryDataModule(LightningDataModule):
 
         Raises:
             DataError: if a split cannot be evaluated or, at the first or last frame of a trajectory, be read; or if
-                there is none to validate on.
+                nothing is left to validate on.
         """
         if stage != "fit":
             return
@@ -161,16 +162,22 @@ class TrajectoryDataModule(LightningDataModule):
             self._history = None
         present = split_paths(self.data_source.folder)
         if "valid" not in present and self.trainer is not None and self.trainer.enable_validation:
-            raise DataError(
-                f"{self.data_source.folder}: no valid.h5 there, by which the best weights are chosen (found:"
-                f" {', '.join(present) or 'no split'}). Put some of the trajectories there, or train without"
-                " validations, which keeps the last weights: --trainer.limit_val_batches 0."
-            )
+            self._hold_out()
         for name in present:
             recordings = self.data_source.recordings(name)
             recordings.check_ends()
             if name != "train":
                 recordings.with_frames(3, "an evaluation")
+
+    def _hold_out(self) -> None:
+        """Validate on a part of the training trajectories."""
+        if isinstance(self.data_source, HoldOut):
+            return
+        if split_renames(self.data_source.folder, ("valid",)):
+            find_split(self.data_source.folder, "valid")  # raises, and says how to rename it
+        self.data_source = HoldOut(self.data_source)
+        held = self.data_source.recordings("valid")
+        rank_zero_info(f"No valid.h5: {held.split.where(held.indices[0])} validates and is not trained on.")
 
     @property
     def has_test(self) -> bool:

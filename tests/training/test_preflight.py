@@ -35,12 +35,22 @@ def refusal(error: type[Exception], *arguments, **options) -> str:
     return str(refused.value)
 
 
-def test_without_a_valid_split_it_trains_without_validations_alone(make_dataset):
-    folder = make_dataset(valid=())
+def test_without_a_valid_split_the_last_training_trajectory_validates(make_dataset, caplog):
+    folder = make_dataset(train=((14, 5), (14, 6), (14, 7)), valid=())
+    caplog.set_level("INFO")
+    data = fit(folder).datamodule
+    assert "train.h5, trajectory 00002 validates and is not trained on." in caplog.text
+    assert [window.mask.shape[1] for window in data.val_dataloader()] == [7]
+    assert len(data.data_source.training_data(4, batch_size=1, buffer_size=1, passes=1, seed=0)[0]) == 2
+    everything = fit(folder, limit_val_batches=0)
+    assert len(everything.train_dataloader.buffer.plan.frames) == 3
+
+
+def test_a_single_trajectory_without_a_valid_split_trains_without_validations_alone(make_dataset):
+    folder = make_dataset(train=((14, 5),), valid=())
     message = refusal(DataError, folder)
-    assert "no valid.h5 there" in message
+    assert "no valid.h5 beside it" in message
     assert "--trainer.limit_val_batches 0" in message
-    assert fit(folder, limit_val_batches=0).global_step == 2
 
 
 @pytest.mark.parametrize("split", ["train", "valid", "test"])

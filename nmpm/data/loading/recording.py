@@ -209,7 +209,10 @@ class SplitRecordings(Sequence[Recording]):
         return len(self.indices)
 
     def __getitem__(self, number: int) -> Recording:  # type: ignore[override]  # (no slices)
-        index = self.indices[number]
+        return self.at(self.indices[number])
+
+    def at(self, index: int) -> Recording:
+        """The trajectory that has this index in the split."""
         names = dict.fromkeys((*self.reader.metadata.fields, *self.scene.fields))
         fields = read_fields(self.split, index, names) if names else {}
         trajectory = replace(self.split.read(index), fields=fields)
@@ -287,7 +290,11 @@ class SplitRecordings(Sequence[Recording]):
             f" frames, {purpose}'s, and are left out.",
             stacklevel=2,
         )
-        return SplitRecordings(self.split, self.reader.metadata, self.scene, enough)
+        return self.subset(enough)
+
+    def subset(self, indices: Sequence[int]) -> SplitRecordings:
+        """Those of the split's trajectories that have these indices."""
+        return SplitRecordings(self.split, self.reader.metadata, self.scene, indices)
 
     def close(self) -> None:
         """Does nothing: a split keeps no file open and no thread running."""

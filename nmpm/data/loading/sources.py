@@ -16,7 +16,7 @@ from nmpm.data.loading.buffer import RecordingProvider
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.window_plan import WindowPlan
 from nmpm.data.scene_inference import infer_scene
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
 
 SourceName = Literal["disk", "simulate", "hub"]
@@ -97,6 +97,51 @@ class FolderSource(DataSource):
     def _unapplied(self) -> Options:
         """Options that the folder's metadata do not have yet: of a converted copy none."""
         return self.options if self.folder == self.path else Options()
+
+
+@dataclass(frozen=True)
+class HoldOut(DataSource):
+    """A source without a valid split, of whose training trajectories the last validates.
+
+    Args:
+        source: With two training trajectories or more.
+
+    Raises:
+        DataError: if it has only one.
+    """
+
+    source: DataSource
+
+    def __post_init__(self) -> None:
+        training = self.source.recordings("train")
+        if len(training) < 2:
+            raise DataError(
+                f"{training.split.path}: there is no valid.h5 beside it, by which the best weights are chosen, and one"
+                " trajectory alone: put another into valid.h5, or train without validations, which keeps the last"
+                " weights: --trainer.limit_val_batches 0."
+            )
+
+    @property
+    def description(self) -> str:
+        return self.source.description
+
+    @property
+    def folder(self) -> Path:
+        return self.source.folder
+
+    @property
+    def scene(self) -> Scene:
+        return self.source.scene
+
+    @cached_property
+    def metadata(self) -> Metadata:
+        return self.source.metadata
+
+    def recordings(self, name: str) -> SplitRecordings:
+        if name not in ("train", "valid"):
+            return self.source.recordings(name)
+        every = self.source.recordings("train")
+        return every.subset(every.indices[:-1] if name == "train" else every.indices[-1:])
 
 
 @dataclass(frozen=True)

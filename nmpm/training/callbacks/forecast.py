@@ -119,9 +119,8 @@ class Forecast(Callback):
         """Seconds of one validation, after its trajectories have been made few enough."""
         if not trainer.enable_validation:
             return 0.0
-        split = data.data_source.recordings("valid").split
-        limit = data.limit_eval or data.validated or len(split)
-        frames = [split.frames(index) - 2 for index in range(len(split))][:limit]
+        limit = data.limit_eval or data.validated
+        frames = [frames - 2 for frames in data.data_source.recordings("valid").frames][:limit]
         seconds = (self._frame_seconds or 0.0) * sum(frames) / trainer.world_size
         left = min(seconds_left(trainer), (total_steps(trainer) - trainer.global_step) * pace)
         count = math.ceil(left / pace / interval) or 1

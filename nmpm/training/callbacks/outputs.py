@@ -52,6 +52,7 @@ class ReportWriter(Callback):
         self.trained_seconds, self.trained_steps = 0.0, 0
         self.trained_precision = self.trained_hardware = ""
         self.curve: list[list[float]] = []  # seconds of training, steps, MSE and overall error of each validation
+        self.progress = ""  # from the start of a fine-tuning to its best validation, in words
         self._since: float | None = None
         self._fitting = False
         self._first_rollout: tuple[Window, Tensor] | None = None
@@ -105,6 +106,7 @@ class ReportWriter(Callback):
         folder = Path(trainer.default_root_dir)
         figures = self._figures(trainer, pl_module, {kind: rows for kind, (rows, _) in errors.items()})
         _write_report(folder, figures)
+        self._print_progress()
         _print_table(f"{figures['dataset']}: test", figures["test"])
         _write_curves(folder / "errors.csv", {kind: curves for kind, (_, curves) in errors.items()})
         if self._first_rollout is not None:
@@ -118,7 +120,12 @@ class ReportWriter(Callback):
         if trainer.is_global_zero:
             folder = Path(trainer.default_root_dir)
             _write_report(folder, self._figures(trainer, module, {}) | {"not_tested": reason})
+            self._print_progress()
             Console().print(f"Not tested: {reason} Written to {folder}: report.json", soft_wrap=True)
+
+    def _print_progress(self) -> None:
+        if self.progress:
+            Console().print(self.progress, soft_wrap=True)
 
     def _elapsed(self) -> float:
         return self.trained_seconds + (time.monotonic() - self._since if self._since is not None else 0.0)
@@ -130,6 +137,7 @@ class ReportWriter(Callback):
         errors, source = _logged(trainer, "test/"), getattr(datamodule, "data_source", None)
         simulation = source.metadata.extra.get("simulation") if source else None
         optional = {
+            "progress": self.progress,
             "test": errors,
             "remark": no_better_than_trivial(errors),
             "simulation": simulation if isinstance(simulation, dict) else None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 from pathlib import Path
@@ -32,15 +33,21 @@ class BestCheckpoint(ModelCheckpoint):
 
     Attributes:
         scored_step: Step of the last weights that have a score; -1 before the first, or where no best weights are left.
+        scores_start: Whether a new training validates the weights that it starts with, so that its best weights are
+            never worse than those.
+        start_score: The score of these weights; None where they were not validated.
     """
 
     scored_step = -1
+    scores_start = False
+    start_score: float | None = None
 
     def state_dict(self) -> dict[str, Any]:
-        return super().state_dict() | {"scored_step": self.scored_step}
+        return super().state_dict() | {"scored_step": self.scored_step, "start_score": self.start_score}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.scored_step = int(state_dict["scored_step"]) if self.best_k_models else -1
+        self.start_score = state_dict.get("start_score")
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         if trainer.state.fn != TrainerFn.FITTING or not self.save_top_k or self.monitor is None:
@@ -60,7 +67,11 @@ class BestCheckpoint(ModelCheckpoint):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         super().on_train_start(trainer, pl_module)
         loop = trainer.fit_loop.epoch_loop
-        due = trainer.global_step > 0 and loop._should_check_val_fx(trainer.fit_loop._data_fetcher)  # type: ignore[arg-type]  # (set by now)
+        if trainer.global_step == 0:
+            due = self.scores_start and trainer.enable_validation
+            self._last_global_step_saved = -1  # Lightning's 0 means that step 0 is saved already
+        else:
+            due = loop._should_check_val_fx(trainer.fit_loop._data_fetcher)  # type: ignore[arg-type]  # (set by now)
         if due and self.scored_step < trainer.global_step:
             first, trainer.validating = trainer._logger_connector._first_loop_iter, True
             loop.val_loop.restarting = False
@@ -70,12 +81,24 @@ class BestCheckpoint(ModelCheckpoint):
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if trainer.state.fn == TrainerFn.FITTING and not trainer.sanity_checking:
             self.scored_step = trainer.global_step
+            if trainer.global_step == 0 and self.monitor:
+                self.start_score = float(trainer.callback_metrics[self.monitor])
         super().on_validation_end(trainer, pl_module)
 
     def score(self, trainer: Trainer) -> None:
         """Take the scores of a validation after the training, and save the weights if they are among the best."""
         self.scored_step = trainer.global_step
         self._save_topk_checkpoint(trainer, self._monitor_candidates(trainer))
+
+    def describe_progress(self, best_step: int, steps: int) -> str:
+        """One line: the score of the weights that a training of so many steps started with, and of the best ones."""
+        start, best = self.start_score or math.nan, float(self.best_model_score or math.nan)
+        if best_step == 0:
+            return (
+                f"None of the validations in {steps} steps was better than that of the start, {self.monitor} ="
+                f" {start:.3g}: the best weights are those that the training started with."
+            )
+        return f"{self.monitor} = {start:.3g} at the start, {best:.3g} after {best_step} of {steps} steps, the best."
 
     def _stored_scores(self) -> dict[str, Tensor]:
         """Paths of the best checkpoints in the folder, and the scores that they state of themselves."""

@@ -1,0 +1,95 @@
+"""Fine-tuning from the command line: the weights that it starts with are the first checkpoint."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from nmpm.cli import main
+from nmpm.training.checkpoints import read_checkpoint
+from nmpm.zoo import Zoo
+
+TINY = """
+model:
+  cells: 16
+  frames: 4
+  unroll: 1
+  schedule: {warmup: 1}
+  processor: {class_path: nmpm.processors.UNet, init_args: {width: 4, depth: 1, perceptron: [4]}}
+data: {batch_size: 2}
+trainer:
+  precision: 32-true
+  val_check_interval: 1
+  check_val_every_n_epoch: null
+  num_sanity_val_steps: 0
+  accelerator: cpu
+  enable_progress_bar: false
+  log_every_n_steps: 1
+  gradient_clip_val: 1.0
+"""
+PATIENT = {"class_path": "lightning.pytorch.callbacks.EarlyStopping"}
+
+
+@pytest.fixture
+def fit(make_dataset, tmp_path, monkeypatch):
+    """Runs `nmpm fit` on made-up data with a learning rate and further words."""
+    monkeypatch.chdir(tmp_path)
+    data = make_dataset(train=((30, 9),) * 2, valid=((30, 9),), test=((30, 9),))
+    Path("tiny.yaml").write_text(TINY)
+
+    def fit(folder: str, steps: int, rate: float, *words: str) -> dict:
+        optimizer = ["--model.optimizer", "torch.optim.SGD", "--model.optimizer.init_args.lr", str(rate)]
+        given = ["--data.path", str(data), "--trainer.max_steps", str(steps), "--trainer.default_root_dir", folder]
+        assert main(["fit", "--config", "tiny.yaml", *optimizer, *given, *words]) == 0
+        return json.loads(Path(folder, "report.json").read_text())
+
+    return fit
+
+
+def weights_of(run: str) -> dict[str, torch.Tensor]:
+    return Zoo.load(run).emulator.state_dict()
+
+
+def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
+    return all(torch.equal(values, other[name]) for name, values in one.items())
+
+
+def test_a_training_that_makes_it_worse_keeps_the_start(fit, capsys):
+    fit("first", 3, 1e-2)
+    report = fit("worse", 3, 1e3, "--start_from", "first")
+    assert same(weights_of("first"), weights_of("worse"))
+    assert read_checkpoint(Path("worse/checkpoints/best.ckpt"))["global_step"] == 0
+    assert "None of the validations in 3 steps was better than that of the start" in report["progress"]
+    assert report["progress"] in capsys.readouterr().out
+    assert [steps for _, steps, *_ in report["curve"]] == [0, 1, 2, 3]
+    assert report["test"]["mse"] == json.loads(Path("first/report.json").read_text())["test"]["mse"]
+
+
+def test_a_training_that_makes_it_better_says_by_how_much(fit):
+    assert "progress" not in fit("first", 1, 1e-4)
+    report = fit("better", 3, 1e-3, "--start_from", "first")
+    errors = [overall for *_, overall in report["curve"]]
+    best = min(range(4), key=errors.__getitem__)
+    assert best > 0
+    assert report["progress"] == (
+        f"valid/overall = {errors[0]:.3g} at the start, {errors[best]:.3g} after {best} of 3 steps, the best."
+    )
+
+
+def test_early_stopping_counts_from_the_start(fit):
+    fit("first", 3, 1e-2)
+    stopping = PATIENT | {"init_args": {"monitor": "valid/overall", "patience": 2}}
+    report = fit("worse", 9, 1e3, "--start_from", "first", "--trainer.callbacks", json.dumps([stopping]))
+    assert report["training"]["steps"] == 2
+    assert same(weights_of("first"), weights_of("worse"))
+
+
+def test_a_resumed_fine_tuning_keeps_the_start_among_the_best(fit):
+    fit("first", 3, 1e-2)
+    fit("worse", 2, 1e3, "--start_from", "first")
+    assert main(["fit", "--resume", "worse", "--trainer.max_steps", "4"]) == 0
+    assert same(weights_of("first"), weights_of("worse"))
+    report = json.loads(Path("worse/report.json").read_text())
+    assert [steps for _, steps, *_ in report["curve"]] == [0, 1, 2, 3, 4]
+    assert "None of the validations in 4 steps" in report["progress"]
