@@ -19,6 +19,7 @@ from torch import Tensor
 from nmpm._support.plain_data import from_spec, to_spec
 from nmpm.grid import Grid
 from nmpm.processors import GridLayout, GridProcessor, Processor
+from nmpm.processors.channels import ChannelChange, OutputSource
 from nmpm.transfer import Transfer
 
 
@@ -94,6 +95,32 @@ class ProcessorContract:
             network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # (torch's stubs lack it)
             last = network(grid.contiguous(memory_format=torch.channels_last))
             torch.testing.assert_close(last, plain, rtol=1e-4, atol=1e-5)
+
+    def test_other_channels_leave_its_output_as_it_is(self) -> None:
+        """A new input, and a new output, which starts at 0; others change places, and one that was 0 is dropped."""
+        for shape in self.shapes:
+            frames, dim, walls = 3, len(shape), (False,) * len(shape)
+            network, grid, added = (
+                self.network(shape, 4, frames).eval(),
+                self.grid(2, 4, *shape),
+                self.grid(2, 1, *shape),
+            )
+            if network.channel_layers is None:
+                return
+            grid[:, 1] = 0.0
+            outputs = [OutputSource(0, zero=True), *(OutputSource(axis) for axis in reversed(range(dim)))]
+            change = ChannelChange(
+                network.channel_layers,
+                GridLayout(4, dim, frames, walls),
+                [2, None, 0, 3, None],
+                outputs,
+                torch.zeros(4),
+            )
+            other = self.recipe.build(GridLayout(5, dim + 1, frames, walls)).to(self.device).eval()
+            other.load_state_dict(change.weights(network.state_dict()))
+            out = other(torch.cat([grid[:, 2:3], added, grid[:, :1], grid[:, 3:], added], dim=1))
+            assert not out[:, :, 0].any()
+            torch.testing.assert_close(out[:, :, 1:].flip(2), network(grid), rtol=1e-4, atol=1e-5)
 
     def test_output_depends_on_the_input_within_the_radius_only(self) -> None:
         network, length = self._strip_network()

@@ -4,7 +4,7 @@ A processor is added by one class and one line here; others are named by their c
 """
 
 from nmpm.processors.axial import Axial
-from nmpm.processors.base import GridLayout, GridProcessor, Processor
+from nmpm.processors.base import ChannelLayers, GridLayout, GridProcessor, Processor
 from nmpm.processors.baselines import Identity, Pointwise
 from nmpm.processors.fourier import FFNO, FNO, TFNO
 from nmpm.processors.patched import Patched
@@ -16,6 +16,7 @@ __all__ = [
     "FNO",
     "TFNO",
     "Axial",
+    "ChannelLayers",
     "ConvNeXt",
     "GridLayout",
     "GridProcessor",

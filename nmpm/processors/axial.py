@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.processors.base import GridLayout, GridProcessor, Processor, full_precision
+from nmpm.processors.base import ChannelLayers, GridLayout, GridProcessor, Processor, full_precision
 from nmpm.processors.convolution import (
     CONVOLUTIONS,
     TRANSPOSED,
@@ -61,6 +61,8 @@ class Axial(Processor):
 
 class AxialNetwork(GridProcessor):
     """Patches, layers, patches back to cells, joined by a convolution with the cells themselves for what is fine."""
+
+    channel_layers = ChannelLayers("cells.convolution", "last")
 
     def __init__(self, recipe: Axial, layout: GridLayout) -> None:
         super().__init__()

@@ -39,6 +39,23 @@ class GridLayout:
         return len(self.periodic)
 
 
+@dataclass(frozen=True)
+class ChannelLayers:
+    """Names of the two layers of a network whose shapes depend on its channels.
+
+    Args:
+        first: Reads the grid state, and has a bias; the second axis of its weight has `cells` entries for each channel,
+            then those of what else it reads.
+        last: Writes the fields; the first axis of its weight has `cells` entries for each channel of each frame. Or a
+            list of networks, `cells` for each channel, whose last layers write a field's m frames.
+        cells: Entries for each channel, more than 1 in networks on patches.
+    """
+
+    first: str
+    last: str
+    cells: int = 1
+
+
 class GridProcessor(nn.Module, ABC):
     """A network from a grid state to the next m grid velocity fields.
 
@@ -47,10 +64,12 @@ class GridProcessor(nn.Module, ABC):
             the whole grid. With a radius, windows of a grid can be computed instead of all of it.
         alignment: Cells by whose multiples the input may be shifted so that the output is shifted alike, e.g. 2 for a
             network that works on a grid half as fine.
+        channel_layers: The layers by which a trained network is given other channels; None, as here, if it cannot be.
     """
 
     radius: int | None = None
     alignment: int = 1
+    channel_layers: ChannelLayers | None = None
 
     @abstractmethod
     def forward(self, grid: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from nmpm.processors.base import GridLayout, GridProcessor, Processor
+from nmpm.processors.base import ChannelLayers, GridLayout, GridProcessor, Processor
 from nmpm.processors.convolution import pointwise
 
 
@@ -59,6 +59,7 @@ class PointwiseNetwork(GridProcessor):
         self.frames = layout.frames
         widths = [layout.in_channels, *recipe.hidden, layout.frames * layout.out_channels]
         self.perceptron = pointwise(widths, layout.dim)
+        self.channel_layers = ChannelLayers("perceptron.0", f"perceptron.{len(self.perceptron) - 1}")
 
     def forward(self, grid: Tensor) -> Tensor:
         out: Tensor = self.perceptron(grid).unflatten(1, (self.frames, -1))

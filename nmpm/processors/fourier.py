@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.processors.base import GridLayout, GridProcessor, Processor, full_precision
+from nmpm.processors.base import ChannelLayers, GridLayout, GridProcessor, Processor, full_precision
 from nmpm.processors.convolution import CONVOLUTIONS, crop
 
 
@@ -74,6 +74,8 @@ class TFNO(FNO):
 
 class FNONetwork(GridProcessor):
     """`neuralop.models.FNO` behind the contract, in float32 whatever autocast says: its transforms need it."""
+
+    channel_layers = ChannelLayers("operator.lifting.fcs.0", "operator.projection.fcs.1")
 
     def __init__(self, recipe: FNO, layout: GridLayout, weights: dict[str, Any]) -> None:
         super().__init__()
@@ -145,6 +147,8 @@ class FFNO(_Fourier):
 
 class FFNONetwork(GridProcessor):
     """Layers x + perceptron(sum over axes of spectral(x)), between perceptrons at each cell."""
+
+    channel_layers = ChannelLayers("first", "last.2")
 
     def __init__(self, recipe: FFNO, layout: GridLayout) -> None:
         super().__init__()

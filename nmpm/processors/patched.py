@@ -14,7 +14,7 @@ from torch import Tensor
 from nmpm._support.plain_data import from_spec
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.processors.base import GridLayout, GridProcessor, Processor
+from nmpm.processors.base import ChannelLayers, GridLayout, GridProcessor, Processor
 from nmpm.processors.convolution import cells_to_channels, channels_to_cells, check_multiple, crop, pad_to_multiple
 from nmpm.processors.unet import UNet
 
@@ -39,7 +39,7 @@ class Patched(Processor):
     def build(self, layout: GridLayout) -> GridProcessor:
         cells = self.patch**layout.dim
         channels = {"in_channels": cells * layout.in_channels, "out_channels": cells * layout.out_channels}
-        return PatchedNetwork(self.patch, self.processor.build(dataclasses.replace(layout, **channels)))
+        return PatchedNetwork(self.patch, cells, self.processor.build(dataclasses.replace(layout, **channels)))
 
     def check_grid(self, grid: Grid) -> None:
         check_multiple(grid, self.patch, f"patches of {self.patch} cells")
@@ -51,12 +51,15 @@ class Patched(Processor):
 class PatchedNetwork(GridProcessor):
     """Patches to channels, the network on (B, C_in * patch ** D, *S / patch), channels back to patches."""
 
-    def __init__(self, patch: int, network: GridProcessor) -> None:
+    def __init__(self, patch: int, cells: int, network: GridProcessor) -> None:
         super().__init__()
         self.patch, self.network = patch, network
         self.alignment = patch * network.alignment
         if network.radius is not None:
             self.radius = patch * network.radius + patch - 1
+        if (inner := network.channel_layers) is not None:
+            names = f"network.{inner.first}", f"network.{inner.last}"
+            self.channel_layers = ChannelLayers(*names, cells * inner.cells)
 
     def forward(self, grid: Tensor) -> Tensor:
         coarse = cells_to_channels(pad_to_multiple(grid, self.patch), self.patch)

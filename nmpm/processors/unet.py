@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.processors.base import GridLayout, GridProcessor, Processor
+from nmpm.processors.base import ChannelLayers, GridLayout, GridProcessor, Processor
 from nmpm.processors.convolution import Convolution, Upsampling, check_multiple, crop, pad_to_multiple, pointwise
 from nmpm.processors.ushape import ushape_radius
 
@@ -48,6 +48,8 @@ class UNet(Processor):
 
 class UNetNetwork(GridProcessor):
     """Level by level down, then up: a convolution at each, a strided one between."""
+
+    channel_layers = ChannelLayers("encoder.0", "decoders")
 
     def __init__(self, recipe: UNet, layout: GridLayout) -> None:
         super().__init__()

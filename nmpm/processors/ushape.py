@@ -18,7 +18,7 @@ from torch.nn import functional
 
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.processors.base import GridLayout, GridProcessor, Processor, full_precision
+from nmpm.processors.base import ChannelLayers, GridLayout, GridProcessor, Processor, full_precision
 from nmpm.processors.convolution import CONVOLUTIONS, Convolution, check_multiple, crop, pad_to_multiple
 
 Modules = Iterable[nn.Module]
@@ -101,6 +101,8 @@ class UNetModern(Processor):
 class UNetModernNetwork(GridProcessor):
     """Residual blocks at each level; strided convolutions down, nearest cells and a convolution up, skips added."""
 
+    channel_layers = ChannelLayers("first.convolution", "last")
+
     def __init__(self, recipe: UNetModern, layout: GridLayout) -> None:
         super().__init__()
         periodic, kernel = layout.periodic, recipe.kernel
@@ -178,6 +180,8 @@ class ConvNeXt(Processor):
 
 class ConvNeXtNetwork(GridProcessor):
     """Blocks at each level; strided convolutions down, nearest cells and 1x1 convolutions up, skips added."""
+
+    channel_layers = ChannelLayers("first.convolution", "last")
 
     def __init__(self, recipe: ConvNeXt, layout: GridLayout) -> None:
         super().__init__()

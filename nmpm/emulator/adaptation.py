@@ -1,0 +1,163 @@
+"""Adaptation: the weights and statistics of an emulator in a recipe whose scene has other channels.
+
+Channels are matched by name. Added inputs get zero weights, dropped ones are replaced by the constant that they have
+where nothing is, and added materials move as the decoder alone says: where a scene has nothing in what is added or
+dropped, the adapted emulator predicts what the original does.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.recipe import EmulatorRecipe
+from nmpm.errors import ConfigError
+from nmpm.processors import GridLayout
+from nmpm.processors.channels import ChannelChange, OutputSource
+from nmpm.scene import Scene
+
+SOLID_STD = 0.25
+"""Standard deviation of an added solid channel: that of walls and obstacles in a fifteenth of the cells."""
+
+GRAVITY = 0.004
+"""Cells per frame²: the size of gravity, for the statistics of its channels, where the emulator's scenes had none."""
+
+
+@torch.no_grad()
+def adapted(emulator: Emulator, recipe: EmulatorRecipe) -> Emulator:
+    """A copy of an emulator's weights and statistics in an emulator of another recipe.
+
+    Cells, scene and constraints may differ. Added inputs have mean 0, no limits, and the standard deviation of the same
+    quantity of other materials; added outputs the scale of that. A network whose first layer pads its input with zeros
+    (those of the zoo do not) sees a step at the walls in a dropped input whose normalised constant is not 0.
+
+    Raises:
+        ConfigError: if the processor, the number of frames or of axes differ, or channels do and the processor does not
+            say which of its layers depend on them.
+    """
+    old, scene = emulator.scene, recipe.scene
+    for name, before, after in (
+        ("processor", emulator.recipe.processor, recipe.processor),
+        ("frames", emulator.frames, recipe.frames),
+        ("dim", old.dim, scene.dim),
+    ):
+        if before != after:
+            raise ConfigError(f"The emulator's weights are for {name} = {before}, not {after}.")
+    with torch.random.fork_rng(devices=[]):  # the weights drawn here are replaced
+        other = recipe.build().to(emulator.device)
+    if other.network_precision != emulator.network_precision:
+        other.processor.to(emulator.network_precision)
+    if _channels(old) == _channels(scene):
+        other.load_state_dict(emulator.state_dict())
+    else:
+        other.load_state_dict(other.state_dict() | _statistics(emulator, other) | _weights(emulator, other))
+    frozen = {name for name, weight in emulator.named_parameters() if not weight.requires_grad}
+    for name, weight in other.named_parameters():
+        weight.requires_grad_(name not in frozen)
+    other.runtime = copy.deepcopy(emulator.runtime)
+    return other.train(emulator.training)
+
+
+def _channels(scene: Scene) -> tuple[tuple[str, ...], ...]:
+    return scene.input_channels, scene.output_channels, scene.fields
+
+
+def _statistics(emulator: Emulator, other: Emulator) -> dict[str, Tensor]:
+    """The other's statistics: those of channels and fields of the same name, and neutral ones."""
+    old, new = emulator.scene, other.scene
+    state = emulator.state_dict()
+    result = {"calibrated": emulator.calibrated}
+    for name in ("input_mean", "input_low", "input_high"):
+        result[name] = _by_name(state[name], old.input_channels, getattr(other, name), new.input_channels)
+    stds = [_input_std(emulator, name) for name in new.input_channels]
+    result["input_std"] = torch.stack(stds)
+    result["output_scale"] = torch.stack([_output_scale(emulator, name) for name in new.output_channels], dim=1)
+    for name in ("mean", "std") if new.fields else ():
+        neutral = getattr(other.field_scales, name)
+        before = getattr(emulator.field_scales, name) if old.fields else neutral[:0]
+        result[f"field_scales.{name}"] = _by_name(before, old.fields, neutral, new.fields)
+    return result
+
+
+def _by_name(values: Tensor, names: Sequence[str], neutral: Tensor, new_names: Sequence[str]) -> Tensor:
+    """Values (C', ...) by new names: of the same name, else neutral ones (C', ...)."""
+    rows = [values[names.index(name)] if name in names else row for name, row in zip(new_names, neutral, strict=True)]
+    return torch.stack(rows)
+
+
+def _like(name: str, names: Sequence[str]) -> list[int]:
+    """Indices of the channel of that name, or else of those of the same quantity of other materials."""
+    if name in names:
+        return [names.index(name)]
+    quantity = name.partition(".")[2]
+    return [index for index, other in enumerate(names) if quantity and other.partition(".")[2] == quantity]
+
+
+def _input_std(emulator: Emulator, name: str) -> Tensor:
+    """The standard deviation (1, ...) of an input channel."""
+    if like := _like(name, emulator.scene.input_channels):
+        return emulator.input_std[like].mean(0)
+    if name == "solid":
+        return torch.full_like(emulator.input_std[0], SOLID_STD)
+    if name.startswith("gravity_"):
+        size = float(torch.linalg.vector_norm(_gravity(emulator.recipe))) or GRAVITY
+        return torch.full_like(emulator.input_std[0], size / emulator.scene.dim**0.5)
+    return torch.ones_like(emulator.input_std[0])
+
+
+def _output_scale(emulator: Emulator, name: str) -> Tensor:
+    """The scale (m, ...) of an output channel."""
+    like = _like(name, emulator.scene.output_channels)
+    return emulator.output_scale[:, like].mean(1) if like else torch.ones_like(emulator.output_scale[:, 0])
+
+
+def _gravity(recipe: EmulatorRecipe) -> Tensor:
+    """The scene's gravity (D,) in cells per frame²; 0 where it varies or is not known."""
+    fall = torch.tensor(recipe.scene.gravity or (0.0,) * recipe.scene.dim, dtype=torch.float64) * recipe.scene.dt**2
+    return recipe.grid.to_cell_displacement(fall, torch.float64)
+
+
+def _weights(emulator: Emulator, other: Emulator) -> dict[str, Tensor]:
+    """The weights of the other's network."""
+    layers = emulator.processor.channel_layers
+    if layers is None:
+        kind = type(emulator.recipe.processor).__name__
+        raise ConfigError(
+            f"{kind} cannot be given other channels ({_differences(emulator.scene, other.scene)}): its network names no"
+            " channel_layers, see nmpm.processors.ChannelLayers."
+        )
+    old, new = emulator.scene, other.scene
+    before, rates = old.input_channels, old.output_channels
+    change = ChannelChange(
+        layers,
+        GridLayout(len(before), len(rates), emulator.frames, old.periodic),
+        [before.index(name) if name in before else None for name in new.input_channels],
+        [OutputSource((_like(name, rates) or [0])[0], name not in rates) for name in new.output_channels],
+        _absent(emulator, other.recipe),
+    )
+    prefix = "processor."
+    state = emulator.state_dict().items()
+    weights = {name.removeprefix(prefix): values for name, values in state if name.startswith(prefix)}
+    return {prefix + name: values for name, values in change.weights(weights).items()}
+
+
+def _absent(emulator: Emulator, recipe: EmulatorRecipe) -> Tensor:
+    """(C_in,) the normalised input channels of an emulator where nothing is, in the scene of another recipe."""
+    empty = torch.zeros_like(emulator.input_mean)
+    names, gravity = emulator.scene.input_channels, _gravity(recipe)
+    for index, name in enumerate(names):
+        if name.startswith("gravity_"):
+            empty[index] = gravity["xyz".index(name[-1])]
+    return emulator.normalise(empty.unsqueeze(0)).flatten()
+
+
+def _differences(old: Scene, new: Scene) -> str:
+    """Names of the channels that differ, as added (+) and dropped (-)."""
+    before, after = (dict.fromkeys((*scene.input_channels, *scene.output_channels)) for scene in (old, new))
+    added = [f"+{name}" for name in after if name not in before]
+    dropped = [f"-{name}" for name in before if name not in after]
+    return " ".join(added + dropped) or "in another order"
