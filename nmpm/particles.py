@@ -186,14 +186,13 @@ class Window(Batched):
 
     def first(self, frames: int) -> Self:
         """The first frames, two or more."""
-        timed: dict[str, Any] = {
-            "frames": self.frames,
-            "present": self.present,
-            "obstacle_frames": self.obstacle_frames,
-            "observed": self.observed,
-        }
-        cut: dict[str, Any] = {name: values[:, :frames] for name, values in timed.items() if values is not None}
-        cut["fields"] = {name: values[:, :frames] for name, values in self.fields.items()}
+        return self.pick_frames(slice(frames))
+
+    def pick_frames(self, picked: slice | list[int]) -> Self:
+        """Some of the frames, two or more."""
+        timed = {name: getattr(self, name) for name in ("frames", "present", "obstacle_frames", "observed")}
+        cut: dict[str, Any] = {name: values[:, picked] for name, values in timed.items() if values is not None}
+        cut["fields"] = {name: v if v.shape[1] == 1 else v[:, picked] for name, v in self.fields.items()}
         return dataclasses.replace(self, **cut)
 
     @property

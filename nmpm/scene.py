@@ -256,6 +256,14 @@ class Reading:
         if min(self.every, self.between) < 1 or max(self.every, self.between) > 1 < min(self.every, self.between):
             raise ConfigError(f"every = {self.every}, between = {self.between}: one is 1, the other 1 or more.")
 
+    def data_frames(self, frames: int) -> int:
+        """Frames of the dataset that a window of at least so many frames of the model needs, 3 or more."""
+        return self.every * (frames - 1) + 1 if self.between == 1 else 2 + math.ceil((frames - 2) / self.between)
+
+    def model_frames(self, frames: int) -> int:
+        """Frames of the model that a window of so many frames of the dataset has; the first two are its start."""
+        return (frames - 1) // self.every + 1 if self.between == 1 else 2 + self.between * (frames - 2)
+
 
 def check_field_names(names: Iterable[str]) -> None:
     """Raise ConfigError unless names of fields can name channels.

@@ -16,11 +16,12 @@ from nmpm.data.format import find_split, split_paths, split_renames
 from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.padded_batch import pin_for
+from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.sources import HoldOut, SourceName, make_source
 from nmpm.data.loading.window_plan import PlanStart, WindowPlan
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
-from nmpm.scene import Boundary, Scene
+from nmpm.scene import Boundary, Reading, Scene
 
 _GPU_SHARE = 0.25  # of the free GPU memory that the buffer may use; the rest is for the model
 
@@ -79,6 +80,11 @@ class TrajectoryDataModule(LightningDataModule):
         validated: Trajectories, the first of the valid split, that validations of a training use where `limit_eval`
             does not say it; None before that is decided, and for all. Kept in checkpoints.
 
+    Attributes:
+        reading: How the data are read for a model, in whose frames the windows and `horizon` then are: with `every`
+            they begin at any frame of the data, and with `between` count only what the data have. None, the default,
+            for data as they are.
+
     Raises:
         ConfigError: if neither `path` nor `name` is given, options contradict each other, or a number is not positive.
     """
@@ -120,6 +126,7 @@ class TrajectoryDataModule(LightningDataModule):
             smooth=smooth,
         )
         self.data_source = make_source(path, name, source, options, generate)
+        self.reading: Reading | None = None
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):
             if value is not None and value < 1:
                 raise ConfigError(f"{key} = {value} must be at least 1.")
@@ -137,8 +144,12 @@ class TrajectoryDataModule(LightningDataModule):
 
     @property
     def scene(self) -> Scene:
-        """The scene of the dataset; for an embedded dataset nothing is simulated."""
-        return self.data_source.scene
+        """The scene of the dataset, as it is read; for an embedded dataset nothing is simulated."""
+        return self.data_source.scene if self.reading is None else self.reading.scene
+
+    def recordings(self, name: str) -> SplitRecordings:
+        """The trajectories of the split "train", "valid" or "test"; raises a DataError if its file is missing."""
+        return self.data_source.recordings(name, self.reading)
 
     @property
     def description(self) -> str:
@@ -164,7 +175,7 @@ class TrajectoryDataModule(LightningDataModule):
         if "valid" not in present and self.trainer is not None and self.trainer.enable_validation:
             self._hold_out()
         for name in present:
-            recordings = self.data_source.recordings(name)
+            recordings = self.recordings(name)
             recordings.check_ends()
             if name != "train":
                 recordings.with_frames(3, "an evaluation")
@@ -176,7 +187,7 @@ class TrajectoryDataModule(LightningDataModule):
         if split_renames(self.data_source.folder, ("valid",)):
             find_split(self.data_source.folder, "valid")  # raises, and says how to rename it
         self.data_source = HoldOut(self.data_source)
-        held = self.data_source.recordings("valid")
+        held = self.recordings("valid")
         rank_zero_info(f"No valid.h5: {held.split.where(held.indices[0])} validates and is not trained on.")
 
     @property
@@ -200,8 +211,14 @@ class TrajectoryDataModule(LightningDataModule):
         history = self._history
         if history is None or history.start.batch > self.batches_seen:  # (the batch-size finder starts over)
             history = _BatchHistory(PlanStart(), self.batch_size, world)
+        if self.reading is not None and self.reading.between > self.horizon:
+            raise ConfigError(
+                f"The data have every {self.reading.between}th of the model's frames, none of the {self.horizon} that a"
+                f" training step predicts: unroll at least {self.reading.between} frames (model.unroll, data.horizon)."
+            )
         self._provider, plan = self.data_source.training_data(
             self.horizon + 2,
+            self.reading,
             batch_size=self.batch_size,
             buffer_size=self.buffer_size,
             passes=self.passes,
@@ -255,9 +272,7 @@ class TrajectoryDataModule(LightningDataModule):
 
     def _evaluation(self, name: str, limit: int | None = None) -> EvaluationLoader:
         rank, world = self.ranks
-        return EvaluationLoader(
-            self.data_source.recordings(name), self.eval_batch_size, limit, rank, world, self.target_device
-        )
+        return EvaluationLoader(self.recordings(name), self.eval_batch_size, limit, rank, world, self.target_device)
 
     @property
     def ranks(self) -> tuple[int, int]:

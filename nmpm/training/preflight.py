@@ -167,12 +167,12 @@ def check_evaluations(trainer: Trainer, module: EmulatorModule, data: Trajectory
     """
     if trainer.enable_validation:
         _check_share("limit_val_batches", trainer.limit_val_batches, len(data.val_dataloader()))
-        errors = _try_metrics(module.valid_errors, data.data_source.recordings("valid"))
+        errors = _try_metrics(module.valid_errors, data.recordings("valid"))
         _check_monitors(trainer, module, {*errors, OVERALL})
     if data.has_test and trainer.limit_test_batches:
         _check_share("limit_test_batches", trainer.limit_test_batches, len(data.test_dataloader()))
         # Two frames and one to predict: the metrics of a test may take minutes for a whole trajectory.
-        _try_metrics(module.test_errors, data.data_source.recordings("test"), frames=3)
+        _try_metrics(module.test_errors, data.recordings("test"), frames=3)
 
 
 def _check_share(option: str, share: float, batches: int) -> None:

@@ -39,7 +39,7 @@ class RecordingProvider(Protocol):
 
 
 class MotionSampler:
-    """Draws windows of `length` frames in proportion to the mean distance that their particles travel."""
+    """Draws windows of `length` frames of the data in proportion to the mean distance that their particles travel."""
 
     def __init__(self, recordings: Mapping[int, Recording], scene: Scene, length: int) -> None:
         distances = {index: _window_distances(recording, scene, length) for index, recording in recordings.items()}
@@ -78,7 +78,7 @@ class _BufferContents:
     padded: PaddedRecordings  # all of them, one per row, in the order of `recordings`
     recordings: Mapping[int, Recording]  # views by index of the trajectory, without padding, in host memory
     motion: MotionSampler | None  # draws windows in proportion to motion; None where the plan has no emphasis
-    length: int  # frames of a window
+    length: int  # frames of the data in a window
 
     @cached_property
     def rows(self) -> dict[int, int]:
@@ -89,7 +89,8 @@ class _BufferContents:
     def first_frames(self) -> dict[int, np.ndarray]:
         """For trajectories with absent particles, the frame at which a window that is drawn starts instead."""
         present = {trajectory: recording.present for trajectory, recording in self.recordings.items()}
-        return {index: first_frames(mask.numpy(), self.length) for index, mask in present.items() if mask is not None}
+        every = 1 if self.padded.reading is None else self.padded.reading.every
+        return {i: first_frames(mask.numpy(), self.length, every) for i, mask in present.items() if mask is not None}
 
     def start_inhabited(self, drawn: Drawn) -> Drawn:
         """The same window, or the next in whose first two frames there is a particle."""

@@ -10,11 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nmpm.data.loading.model_frames import add_frames
 from nmpm.data.loading.presence import find_tracks
 from nmpm.data.loading.recording import Recording
 from nmpm.errors import DataError
 from nmpm.particles import Window
-from nmpm.scene import Scene
+from nmpm.scene import Reading, Scene
 
 _NO_TRACK = (-1, 0, 0)
 """Padding among tracks: no column, and a frame that exists."""
@@ -25,12 +26,13 @@ class PaddedRecordings:
     """S recordings of a scene, padded to the longest and largest; padding particles are at the domain's centre.
 
     Args:
-        frames: (S, T, N, D) positions, in domain length.
+        frames: (S, T, N, D) positions, in domain length, in all frames of the data.
         material, mask, obstacle, obstacle_mask, gravity, fields, present, obstacle_frames, volume: as in `Window`, with
             S in place of B.
         scene: The recordings' scene.
         tracks: (S, K, 3) the recordings' tracks, padded with such that are never there; None where all particles
             always are.
+        reading: The recordings' reading.
     """
 
     frames: Tensor
@@ -45,6 +47,7 @@ class PaddedRecordings:
     obstacle_frames: Tensor | None = None
     volume: Tensor | None = None
     tracks: np.ndarray | None = None
+    reading: Reading | None = None
 
     @classmethod
     def stack(cls, recordings: Sequence[Recording], scene: Scene) -> PaddedRecordings:
@@ -66,6 +69,7 @@ class PaddedRecordings:
             **_stack_presence(recordings),
             obstacle_frames=_stack_obstacle_frames(recordings, centre),
             volume=_stack_volumes(recordings),
+            reading=recordings[0].reading,
         )
 
     def recording(self, row: int, original: Recording) -> Recording:
@@ -84,6 +88,7 @@ class PaddedRecordings:
             tracks=original.tracks,
             obstacle_frames=original.obstacle_frames,
             volume=original.volume,
+            reading=original.reading,
         )
 
     def to(self, device: torch.device) -> PaddedRecordings:
@@ -97,21 +102,31 @@ class PaddedRecordings:
         On the scene's periodic axes positions are unwrapped from the first frame on, so that differences between frames
         are displacements. Windows are padded to a number of particles, without those that are there only before or
         only after the window; when it is left out, all particles of the largest recording are in the windows.
+
+        Rows, first frames and `length` are the data's; the windows' frames are the model's where the recordings have a
+        reading.
         """
         row = _index_tensor(rows, self.frames.device)
         first = _index_tensor(starts, self.frames.device)
-        frame = first[:, None] + torch.arange(length, device=self.frames.device)
+        between = 1 if self.reading is None else self.reading.between
+        frame = first[:, None] + torch.arange(0 if between == 1 else -1, length, device=self.frames.device)
+        frame = frame if between == 1 else frame.clamp(min=0)
         if self.tracks is None:
             window = self._gather_columns(row, frame, slice(particles))
         else:
             tracks = _tracks_in_windows(self.tracks[rows], starts, length, particles)
             window = self._gather_tracks(row, frame, _index_tensor(tracks, self.frames.device))
         unwrap(window.frames, self.scene)
-        if self.obstacle_frames is None:
-            return window
-        moved = self.obstacle_frames[row[:, None], frame]
-        unwrap(moved, self.scene)
-        return replace(window, obstacle_frames=moved, obstacle=moved[:, 1])
+        if self.obstacle_frames is not None:
+            window.obstacle_frames = self.obstacle_frames[row[:, None], frame]
+            unwrap(window.obstacle_frames, self.scene)
+        if self.reading is not None and self.reading.every > 1:
+            window = window.pick_frames(slice(None, None, self.reading.every))
+        if between > 1:
+            window = add_frames(window, between, first > 0)
+        if window.obstacle_frames is not None:
+            window.obstacle = window.obstacle_frames[:, 1]
+        return window
 
     def _gather_columns(self, row: Tensor, frame: Tensor, kept: slice) -> Window:
         """The windows of (B,) rows and (B, T) frames with some particles, the same ones for all rows."""
@@ -157,9 +172,12 @@ def collate(recordings: Sequence[Recording], scene: Scene, length: int | None = 
     """Makes one batch of the first `length` frames of B recordings; of all frames, equally many, when None.
 
     Returns:
-        Window: padded to the largest recording.
+        Window: padded to the largest recording. Where recordings have a reading, `length` counts frames of the model,
+            and the window goes on to the next frame that the data have.
     """
-    frames = len(recordings[0].frames) if length is None else length
+    reading, frames = recordings[0].reading, len(recordings[0].frames)
+    if length is not None:
+        frames = length if reading is None else reading.data_frames(length)
     return PaddedRecordings.stack(recordings, scene).gather(range(len(recordings)), [0] * len(recordings), frames)
 
 

@@ -59,7 +59,7 @@ def find_tracks(present: np.ndarray, ids: np.ndarray | None = None) -> np.ndarra
     return np.stack([column[begins], frame[begins], frame[ends]], axis=1)
 
 
-def first_frames(present: np.ndarray, length: int) -> np.ndarray:
+def first_frames(present: np.ndarray, length: int, every: int = 1) -> np.ndarray:
     """The first frame, for each of the windows of `length` frames, of the next window that has a velocity at its start.
 
     That is, of the next in whose first two frames some particle is there, or else of the last such window.
@@ -67,9 +67,10 @@ def first_frames(present: np.ndarray, length: int) -> np.ndarray:
     Args:
         present: (T, N) whether each particle is there in each frame.
         length: Frames of a window.
+        every: Frames from the window's first to its second.
     """
     windows = len(present) - length + 1
-    inhabited = np.flatnonzero((present[1:] & present[:-1]).any(axis=1)[:windows])
+    inhabited = np.flatnonzero((present[every:] & present[:-every]).any(axis=1)[:windows])
     if not len(inhabited):
         return np.full(windows, windows - 1)
     following = np.searchsorted(inhabited, np.arange(windows))

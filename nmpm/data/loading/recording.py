@@ -4,6 +4,9 @@ A recording holds what a model needs of a trajectory: the moving particles, thei
 at rest or moving as recorded, and gravity in length per frame squared. Where a particle is absent, its position and its
 fields are those that it had last, or else will have first, so that all values are finite and no border of a period lies
 between them.
+
+Where data are read for a model (`nmpm.scene.Reading`), materials have the model's names, and gravity is in length per
+frame of the model squared. Frames stay those of the data until windows are gathered.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ from nmpm.data.statistics import first_moving_particle, first_outside, without_t
 from nmpm.data.times import check_times
 from nmpm.data.volumes import SIZES, mean_volume, volumes
 from nmpm.errors import DataError
-from nmpm.scene import Scene
+from nmpm.scene import Reading, Scene
 
 
 @dataclass(frozen=True)
@@ -43,14 +46,22 @@ class Recording:
     tracks: np.ndarray | None = None  # (K, 3) where some are absent, see `find_tracks`: a column may hold several
     obstacle_frames: Tensor | None = None  # (T, M, D) float32; None where no obstacle of the scene moves
     volume: Tensor | None = None  # (N,) float32 volumes as multiples of the scene's `particle_volume`; None for 1
+    reading: Reading | None = None  # how windows are taken out of the frames; as they are when None
 
 
 @dataclass(frozen=True)
 class RecordingReader:
-    """Converts trajectories of a scene to recordings and validates them; the metadata name the type ids."""
+    """Converts trajectories of a scene to recordings and validates them; the metadata name the type ids.
+
+    Args:
+        metadata: Of the dataset.
+        scene: The scene of the recordings, the reading's where there is one.
+        reading: How the data are read for a model.
+    """
 
     metadata: Metadata
     scene: Scene
+    reading: Reading | None = None
 
     def recording(
         self, trajectory: Trajectory, where: str, volume: np.ndarray | None = None, ids: np.ndarray | None = None
@@ -90,6 +101,7 @@ class RecordingReader:
             tracks=None if presence is None else find_tracks(presence.present, None if ids is None else ids[:, moving]),
             obstacle_frames=torch.from_numpy(obstacles) if self.scene.moving_obstacles else None,
             volume=None if volume is None else _positive(volume, moving, where),
+            reading=self.reading,
         )
 
     def _obstacles(self, position: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
@@ -163,8 +175,10 @@ class RecordingReader:
 
     def _materials(self, types: np.ndarray, where: str) -> np.ndarray:
         index = np.zeros(types.shape, dtype=np.int64)
+        renamed = {} if self.reading is None else self.reading.materials
         for type_id in np.unique(types).tolist():
             name = self.metadata.particle_types[type_id]
+            name = renamed.get(name, name)
             if name not in self.scene.materials:
                 raise DataError(
                     f"{where}: the material {name!r} (type {type_id}) is not in the scene, which has"
@@ -191,19 +205,28 @@ class SplitRecordings(Sequence[Recording]):
     Args:
         split: The split.
         metadata: Of its dataset.
-        scene: The scene that the trajectories share.
+        scene: The scene that the trajectories share; a reading's takes its place.
         indices: Those of the trajectories in the split; all of them when None.
+        reading: How they are read for a model; as they are when None.
 
     Raises:
         DataError: if file and scene differ in the number of axes.
     """
 
-    def __init__(self, split: Split, metadata: Metadata, scene: Scene, indices: Sequence[int] | None = None) -> None:
+    def __init__(
+        self,
+        split: Split,
+        metadata: Metadata,
+        scene: Scene,
+        indices: Sequence[int] | None = None,
+        reading: Reading | None = None,
+    ) -> None:
+        scene = scene if reading is None else reading.scene
         if split.dim != scene.dim:
             raise DataError(f"{split.path}: positions have {split.dim} dimensions, the scene has {scene.dim}.")
         self.split, self.scene = split, scene
         self.indices = range(len(split)) if indices is None else indices
-        self.reader = RecordingReader(metadata, scene)
+        self.reader = RecordingReader(metadata, scene, reading)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -234,8 +257,13 @@ class SplitRecordings(Sequence[Recording]):
 
     @property
     def frames(self) -> tuple[int, ...]:
-        """Number of frames of each trajectory."""
+        """Number of frames of each trajectory, of the dataset."""
         return tuple(map(self.split.frames, self.indices))
+
+    def predicted_frames(self, index: int) -> int:
+        """Frames that a rollout of a trajectory of the split predicts, of the model where data are read for one."""
+        frames, reading = self.split.frames(index), self.reader.reading
+        return (frames if reading is None else reading.model_frames(frames)) - 2
 
     @property
     def max_bytes(self) -> int:
@@ -270,13 +298,14 @@ class SplitRecordings(Sequence[Recording]):
         """Those of the trajectories that have enough frames; a warning counts the others.
 
         Args:
-            least: Frames that a trajectory needs.
+            least: Frames that a trajectory needs, of the model where the data are read for one.
             purpose: What needs them, in words.
 
         Raises:
             DataError: if no trajectory has as many.
         """
-        frames = self.frames
+        frames, reading = self.frames, self.reader.reading
+        least = least if reading is None else reading.data_frames(least)
         if min(frames) >= least:
             return self
         if max(frames) < least:
@@ -294,7 +323,7 @@ class SplitRecordings(Sequence[Recording]):
 
     def subset(self, indices: Sequence[int]) -> SplitRecordings:
         """Those of the split's trajectories that have these indices."""
-        return SplitRecordings(self.split, self.reader.metadata, self.scene, indices)
+        return SplitRecordings(self.split, self.reader.metadata, self.scene, indices, self.reader.reading)
 
     def close(self) -> None:
         """Does nothing: a split keeps no file open and no thread running."""

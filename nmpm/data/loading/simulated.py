@@ -23,7 +23,7 @@ from nmpm.data.loading.sources import DataSource
 from nmpm.data.loading.window_plan import EndlessWindowPlan, WindowPlan
 from nmpm.data.simulation import simulate_all
 from nmpm.errors import ConfigError
-from nmpm.scene import Scene
+from nmpm.scene import Reading, Scene
 from nmpm.sim import Preset
 
 _STREAM = len(SPLITS)  # not the index of a split, so that no seed is that of a written trajectory
@@ -86,7 +86,11 @@ class SimulatedSource(EmbeddedSource):
         request = catalog.simulation_request(self.name, **options)
         return SimulatedRecordings(request.preset, request.seed, self.generate.get("workers"))
 
-    def training_data(self, length: int, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
+    def training_data(
+        self, length: int, reading: Reading | None = None, **plan: Any
+    ) -> tuple[RecordingProvider, WindowPlan]:
+        length = length if reading is None else reading.data_frames(length)
+        self.training_recordings.read_for(reading)
         frames = self.training_recordings.preset.frames + 1
         if frames < length:
             raise ConfigError(
@@ -111,6 +115,13 @@ class SimulatedRecordings:
         self.reader = RecordingReader(preset_metadata(preset), self.scene)
         self._lock = Lock()
         self._requests: OrderedDict[tuple[int, ...], Task[list[Recording]]] = OrderedDict()
+
+    def read_for(self, reading: Reading | None) -> None:
+        """Reads the trajectories for a model from now on; as they are when None."""
+        if reading != self.reader.reading:
+            self.close()
+            self.scene = self.preset.scene if reading is None else reading.scene
+            self.reader = RecordingReader(self.reader.metadata, self.scene, reading)
 
     @property
     def max_bytes(self) -> int:

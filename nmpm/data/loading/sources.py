@@ -17,7 +17,7 @@ from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.window_plan import WindowPlan
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
-from nmpm.scene import Scene
+from nmpm.scene import Reading, Scene
 
 SourceName = Literal["disk", "simulate", "hub"]
 
@@ -47,21 +47,28 @@ class DataSource(abc.ABC):
         """The metadata of the folder."""
         return read_metadata(self.folder)
 
-    def recordings(self, name: str) -> SplitRecordings:
-        """The trajectories of the split "train", "valid" or "test"; raises a DataError if its file is missing."""
-        return SplitRecordings(Split(find_split(self.folder, name)), self.metadata, self.scene)
+    def recordings(self, name: str, reading: Reading | None = None) -> SplitRecordings:
+        """The trajectories of the split "train", "valid" or "test"; raises a DataError if its file is missing.
 
-    def training_data(self, length: int, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
+        Read for a model where a reading is given.
+        """
+        return SplitRecordings(Split(find_split(self.folder, name)), self.metadata, self.scene, reading=reading)
+
+    def training_data(
+        self, length: int, reading: Reading | None = None, **plan: Any
+    ) -> tuple[RecordingProvider, WindowPlan]:
         """The trajectories to train on, and which of their windows make up which batch.
 
         Args:
             length: Frames of a window; shorter trajectories are left out, with a warning that counts them.
+            reading: How the data are read for a model, in whose frames `length` is; the plan counts the data's.
             plan: The other fields of `WindowPlan`, except `frames`.
 
         Raises:
             DataError: if all trajectories are shorter.
         """
-        recordings = self.recordings("train").with_frames(length, "a training window")
+        recordings = self.recordings("train", reading).with_frames(length, "a training window")
+        length = length if reading is None else reading.data_frames(length)
         return recordings, WindowPlan(frames=recordings.frames, length=length, **plan)
 
 
@@ -137,10 +144,10 @@ class HoldOut(DataSource):
     def metadata(self) -> Metadata:
         return self.source.metadata
 
-    def recordings(self, name: str) -> SplitRecordings:
+    def recordings(self, name: str, reading: Reading | None = None) -> SplitRecordings:
         if name not in ("train", "valid"):
-            return self.source.recordings(name)
-        every = self.source.recordings("train")
+            return self.source.recordings(name, reading)
+        every = self.source.recordings("train", reading)
         return every.subset(every.indices[:-1] if name == "train" else every.indices[-1:])
 
 

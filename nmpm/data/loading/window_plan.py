@@ -49,7 +49,7 @@ class WindowPlan:
 
     Args:
         frames: Frames of each trajectory of the dataset.
-        length: Frames of a window.
+        length: Frames of a window, of the dataset as `frames`.
         start: Where the batches of this size start, if there were batches of another size before.
         bucket: `bucket_batches`.
 

@@ -63,7 +63,7 @@ class Forecast(Callback):
         self._since = math.nan
         data = trainer.datamodule  # type: ignore[attr-defined]  # (Lightning sets it)
         if isinstance(data, TrajectoryDataModule) and data.validated is None and not trainer.sanity_checking:
-            data.validated = len(data.data_source.recordings("valid"))  # a resumed training keeps to it
+            data.validated = len(data.recordings("valid"))  # a resumed training keeps to it
 
     def on_validation_batch_start(self, *_: Any) -> None:
         self._batch_start = time.monotonic()
@@ -84,8 +84,8 @@ class Forecast(Callback):
         loader = trainer.test_dataloaders
         if self._step < 0 or not isinstance(loader, EvaluationLoader) or not isinstance(pl_module, EmulatorModule):
             return  # no training came before, or another kind
-        split, batches = loader.recordings.split, loader.batches[: int(trainer.num_test_batches[0])]
-        frames = sum(split.frames(index) - 2 for batch in batches for index in batch)
+        batches = loader.batches[: int(trainer.num_test_batches[0])]
+        frames = sum(loader.recordings.predicted_frames(index) for batch in batches for index in batch)
         takes = f" takes about {_clock(frames * self._frame_seconds)}" if self._frame_seconds else ""
         slow = [type(metric).__name__ for metric in pl_module.test_errors.of_model if not metric.cheap]
         more = f", and the time of {', '.join(slow)}" if slow else ""
@@ -119,8 +119,9 @@ class Forecast(Callback):
         """Seconds of one validation, after its trajectories have been made few enough."""
         if not trainer.enable_validation:
             return 0.0
+        recordings = data.recordings("valid")
         limit = data.limit_eval or data.validated
-        frames = [frames - 2 for frames in data.data_source.recordings("valid").frames][:limit]
+        frames = list(map(recordings.predicted_frames, recordings.indices))[:limit]
         seconds = (self._frame_seconds or 0.0) * sum(frames) / trainer.world_size
         left = min(seconds_left(trainer), (total_steps(trainer) - trainer.global_step) * pace)
         count = math.ceil(left / pace / interval) or 1

@@ -1,0 +1,97 @@
+"""Windows in a model's frames, of data that have only every k-th of them.
+
+With k frames of the model per frame of the data, a free fall has v_n = (x_n - x_{n-k}) / k + g (k - 1) / 2 in the
+model's frame n, as x is quadratic in n: the velocity at a frame is the mean one since the last frame of the data, and
+half of what the acceleration adds in between.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from nmpm.particles import Window
+
+_AT_REST = 1 / 8
+"""Of the step that gravity alone gives: particles whose steps are shorter lie on something."""
+
+
+def add_frames(window: Window, between: int, has_earlier: Tensor) -> Window:
+    """A window of the model's frames, of one of the data's that has one frame more at its beginning.
+
+    The second frame and every `between`-th after it are the data's, to the bit. Those in between are interpolated:
+    positions so that constant accelerations are exact, fields and obstacles linearly. The first is such that the
+    difference to the second is the best estimate of the velocity there.
+
+    Args:
+        window: (B, F, …) frames of the data, of which the third is the second of the result; gravity is in length per
+            frame of the model squared.
+        between: Frames of the model per frame of the data.
+        has_earlier: (B,) whether the data have the first frame; otherwise it is of any value.
+    """
+    frames, present = window.frames, window.present
+    known = torch.ones_like(frames[..., 0], dtype=torch.bool) if present is None else present
+    known = torch.cat([known[:, :1] & has_earlier[:, None, None], known[:, 1:]], dim=1)
+    change = frames.diff(n=2, dim=1)
+    change_known = (known[:, 2:] & known[:, 1:-1] & known[:, :-2]).unsqueeze(-1)
+    velocity = model_velocity(
+        frames[:, 2] - frames[:, 1],
+        change[:, 0].where(change_known[:, 0], torch.nan),
+        window.gravity.unsqueeze(1) * between**2,
+        1 / between,
+    )
+    path = interpolate(frames[:, 1:], between, change.where(change_known, 0.0)[:, 1:])
+    path[:, 0] = path[:, 1] - velocity
+    observed = torch.zeros(path.shape[:2], dtype=torch.bool, device=path.device)
+    observed[:, 1::between] = True
+    moved, fields = window.obstacle_frames, window.fields
+    return dataclasses.replace(
+        window,
+        frames=path,
+        fields={n: v if v.shape[1] == 1 else interpolate(v[:, 1:], between) for n, v in fields.items()},
+        present=None if present is None else interpolate(present[:, 1:].float(), between) == 1,
+        obstacle_frames=None if moved is None else interpolate(moved[:, 1:], between),
+        observed=observed,
+    )
+
+
+def model_velocity(step: Tensor, change: Tensor, gravity: Tensor, ratio: float) -> Tensor:
+    """Velocity (…, N, D) at a frame, in length per frame of a model, from the last step between frames of the data.
+
+    r Δ + r (1 - r) a / 2 with r frames of the data per frame of the model, exact at constant acceleration. That is the
+    change of the steps, or gravity where none is known and the particle moves; but no more than gravity, so that a
+    collision is not extrapolated, where there is gravity.
+
+    Args:
+        step: Δ (…, N, D) to this frame, in length per frame of the data.
+        change: (…, N, D) by how much it differs from the step before; NaN where that is not known.
+        gravity: (…, 1, D) in length per frame of the data squared.
+        ratio: r.
+    """
+    pull = gravity.norm(dim=-1, keepdim=True)
+    moves = step.norm(dim=-1, keepdim=True) >= _AT_REST * pull
+    change = torch.where(change.isnan(), gravity * moves, change)
+    size = change.norm(dim=-1, keepdim=True)
+    change = torch.where((size > pull) & (pull > 0), change * (pull / size), change)
+    return ratio * step + ratio * (1 - ratio) / 2 * change
+
+
+def interpolate(values: Tensor, between: int, change: Tensor | None = None) -> Tensor:
+    """Values at the model's frames (B, 2 + k (S - 2), …), from one before the second of (B, S, …) at the data's.
+
+    Args:
+        values: At S frames, 2 or more.
+        between: k.
+        change: (B, S - 2, …) second differences of the values, at all but the first and the last frame; linear between
+            the frames when left out.
+    """
+    share = torch.arange(between, device=values.device, dtype=values.dtype) / between
+    share = share.view(-1, *(1,) * (values.dim() - 2))
+    path = values[:, :-1].unsqueeze(2) + share * values.diff(dim=1).unsqueeze(2)
+    if change is not None and change.shape[1]:
+        first = torch.cat([change[:, :1], change], dim=1)
+        last = torch.cat([change, change[:, -1:]], dim=1)
+        path = path + share * (share - 1) / 4 * (first + last).unsqueeze(2)
+    return torch.cat([path.flatten(1, 2)[:, between - 1 :], values[:, -1:]], dim=1)
