@@ -212,7 +212,7 @@ def _nonzero(scale: Tensor) -> Tensor:
 def calibrated_range(emulator: Emulator, prefix: str) -> tuple[Tensor, Tensor]:
     """Lower and upper limits (D,) of the input channels of that prefix, in length/s; infinite where unlimited."""
     scale = torch.tensor(emulator.grid.spacing, dtype=torch.float64) / emulator.scene.dt
-    low, high = (_values(emulator, limit, prefix) for limit in (emulator.input_low, emulator.input_high))
+    low, high = (channel_values(emulator, limit, prefix) for limit in (emulator.input_low, emulator.input_high))
     low = torch.where(low <= -UNLIMITED / 2, -torch.inf, low)
     return low * scale, torch.where(high >= UNLIMITED / 2, torch.inf, high) * scale
 
@@ -229,7 +229,9 @@ def usual_gravity(emulator: Emulator) -> Tensor:
     Downwards along the second axis, as strong as in the root mean square of the training, within the calibrated range.
     """
     scale = torch.tensor(emulator.grid.spacing, dtype=torch.float64) / emulator.scene.dt**2
-    mean, std = (_values(emulator, each, "gravity_") * scale for each in (emulator.input_mean, emulator.input_std))
+    mean, std = (
+        channel_values(emulator, each, "gravity_") * scale for each in (emulator.input_mean, emulator.input_std)
+    )
     down = torch.zeros_like(mean)
     down[1] = -(mean.square() + std.square()).sum().sqrt()
     return torch.clamp(down, *gravity_range(emulator))
@@ -243,7 +245,7 @@ def with_usual_gravity(emulator: Emulator, state: Particles) -> Particles:
     return dataclasses.replace(state, gravity=pull.expand(state.gravity.shape))
 
 
-def _values(emulator: Emulator, statistic: Tensor, prefix: str) -> Tensor:
+def channel_values(emulator: Emulator, statistic: Tensor, prefix: str) -> Tensor:
     """Of a statistic of the input channels, the values (D,) of those of that prefix, in cells, on the CPU."""
     channels = [i for i, name in enumerate(emulator.scene.input_channels) if name.startswith(prefix)]
     return statistic[channels].flatten().cpu().double()

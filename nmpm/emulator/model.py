@@ -34,6 +34,7 @@ from nmpm.transfer import Transfer
 
 if TYPE_CHECKING:
     from nmpm.emulator.recipe import EmulatorRecipe
+    from nmpm.emulator.similarity import Match
 
 NETWORK_PRECISIONS: Mapping[str, torch.dtype] = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
 """Precisions of the network in rollouts, by name; everything else computes in float32."""
@@ -181,6 +182,10 @@ class Emulator(nn.Module):
     def over(self, scene: Scene) -> Emulator:
         """A copy of weights and statistics for another scene; raises as `EmulatorRecipe.over`."""
         return self.rebuilt(self.recipe.over(scene))
+
+    def matched(self, match: Match) -> Emulator:
+        """A copy of weights and statistics for foreign data, see `nmpm.emulator.similarity.find_match`."""
+        return self.rebuilt(match.recipe)
 
     def rebuilt(self, recipe: EmulatorRecipe) -> Emulator:
         """A copy of weights and statistics in an emulator of another recipe whose tensors have the same shapes."""

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
-from nmpm._support.plain_data import from_plain, from_spec, to_plain, to_spec
+from nmpm._support.plain_data import from_plain, from_spec, to_plain, to_spec, to_tuples
 from nmpm.decoders import Decoder, Residual
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.model import Emulator
@@ -37,6 +37,8 @@ class EmulatorRecipe:
         decoder: What the network's output means.
         grid_noise: Standard deviation of the Gaussian noise on the normalised grid state, in training only.
         constraints: Physical limits enforced in rollouts; only `bounds` also in training.
+        particles_per_cell: Fewest and most particles in a filled cell of the scenes that it is trained on; None where
+            they are all alike, as the scene says.
 
     Raises ConfigError if scene, grid, processor and constraints do not suit each other.
     """
@@ -49,6 +51,7 @@ class EmulatorRecipe:
     decoder: Decoder = Residual()  # noqa: RUF009
     grid_noise: float = 0.0
     constraints: Constraints = Constraints()  # noqa: RUF009
+    particles_per_cell: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         scene = self.scene if isinstance(self.scene, Scene) else Scene.from_dict(self.scene)
@@ -60,11 +63,14 @@ class EmulatorRecipe:
             "processor": from_spec(self.processor, Processor),
             "decoder": from_spec(self.decoder, Decoder),
             "constraints": given if isinstance(given, Constraints) else from_plain(Constraints, given, "constraints"),
+            "particles_per_cell": to_tuples(self.particles_per_cell),
         }
         for name, value in read.items():
             object.__setattr__(self, name, value)
         if self.frames < 1:
             raise ConfigError(f"frames = {self.frames}: a call predicts at least 1 frame.")
+        if self.particles_per_cell and not 0 < self.particles_per_cell[0] <= self.particles_per_cell[1]:
+            raise ConfigError(f"particles_per_cell = {self.particles_per_cell}: the fewest, then the most.")
         if self.constraints.energy and not self.scene.gravity_known:
             raise ConfigError(
                 "constraints.energy needs a scene whose gravity is known: give data.gravity, or switch it off."
@@ -111,8 +117,9 @@ class EmulatorRecipe:
         return dataclasses.replace(self, scene=scene, cells=tuple(round(side) for side in sides))
 
     def to_dict(self) -> dict[str, Any]:
-        """The recipe as plain lists, strings and numbers, with the version of this form."""
-        plain = {field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self)}
+        """The recipe as plain lists, strings and numbers, with the version of this form; without what is absent."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        plain = {name: _plain(value) for name, value in values.items() if value is not None}
         return {"format": FORMAT, **plain}
 
     @classmethod

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
 from numpy.typing import ArrayLike
@@ -27,13 +30,19 @@ from nmpm.emulator import (
 from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.emulator.input_checks import warn_of_start_outside
 from nmpm.emulator.runtimes import Runtime
+from nmpm.emulator.similarity import Match
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
 from nmpm.zoo.card import preset_of
+from nmpm.zoo.matching import match_data
 from nmpm.zoo.optimization import AUTO, optimize
 from nmpm.zoo.starts import state_of
 from nmpm.zoo.states import Bodies, StateBuilder
+
+if TYPE_CHECKING:
+    from nmpm.data.datamodule import TrajectoryDataModule
+    from nmpm.data.dataset import Dataset
 
 _EXAMPLE = 300
 """Particles of the example by which runtimes are compared."""
@@ -46,10 +55,12 @@ class Pretrained:
     Args:
         emulator: In evaluation mode.
         card: The content of `card.yaml`, or what is known of a checkpoint.
+        match: How the emulator takes foreign data, once `fit_to` has made it do so.
     """
 
     emulator: Emulator
     card: Mapping[str, Any]
+    match: Match | None = None
 
     def __repr__(self) -> str:
         """One line: name, data, network and device; the card is long."""
@@ -183,15 +194,43 @@ class Pretrained:
             raise ConfigError(f"Networks run in {' or '.join(NETWORK_PRECISIONS)}, not in {precision!r}.")
         return dataclasses.replace(self, emulator=self.emulator.with_network(NETWORK_PRECISIONS[precision]))
 
-    def over(self, scene: Scene) -> Pretrained:
-        """The same weights for other scenes, on a grid over their domain with cells of the size of this model's.
+    def fit_to(
+        self,
+        data: Scene | str | Path | Dataset | TrajectoryDataModule,
+        materials: Mapping[str, str] | None = None,
+        stride: Fraction | float | str | None = None,
+        strict: bool = False,
+    ) -> Pretrained:
+        """The same weights for foreign data, in their units: on cells, and at frames, in which they are like its own.
+
+            model = Zoo.load("sandramps").fit_to("grains", materials={"big": "sand", "small": "sand"})
+            print("\n".join(model.match.lines))
+
+        Matched are gravity in cells per frame², or speeds where there is none, and the particles per cell. A scene in
+        this model's units, with its gravity and time step and a domain of whole cells, keeps the cells.
 
         Args:
-            scene: With another domain, bounds or obstacles, or other particles' volume, such as
-                `dataclasses.replace(model.scene, bounds=…, domain=…)`. Materials, gravity, time step and kinds of
-                boundary must be this model's, and the domain a whole number of cells; else ConfigError.
+            data: A scene; or a file or folder, a dataset of `nmpm.load_trajectories` or a datamodule, of which speeds
+                are measured, too.
+            materials: This model's material by the data's name; those left out are told by their names.
+            stride: Frames of the data for one of this model, such as 2 or "1/4"; the best one if left out.
+            strict: Whether to raise an error for what could not be matched, instead of a warning.
+
+        Raises:
+            ConfigError: if the numbers of axes differ, the materials cannot be told, the grid would be too large, or,
+                in strict mode, gravity, particles, speeds or boundaries are not this model's.
+
+        Warns:
+            UserWarning: for each of these that could not be matched, with its factor.
         """
-        return dataclasses.replace(self, emulator=self.emulator.over(scene))
+        match = match_data(self, data, materials, stride, strict)
+        for warning in match.warnings:
+            warnings.warn(warning, stacklevel=2)
+        return dataclasses.replace(self, emulator=self.emulator.matched(match), match=match)
+
+    def over(self, scene: Scene) -> Pretrained:
+        """As `fit_to`, for a scene such as `dataclasses.replace(model.scene, bounds=…, domain=…)`."""
+        return self.fit_to(scene)
 
     def optimized(self, runtime: str | Runtime = AUTO, precision: str | None = None) -> Pretrained:
         """The same model for inference alone, its network computed by a faster runtime than torch.

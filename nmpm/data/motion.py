@@ -1,0 +1,42 @@
+"""How fast the particles of a dataset move, from a few frames of a few trajectories."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from nmpm.data.format import SPLITS, Metadata, Split, find_split
+from nmpm.data.gravity import trajectory_gravity
+from nmpm.data.statistics import displacements
+from nmpm.scene import Motion
+
+_TRAJECTORIES, _PAIRS = 8, 12
+_QUANTILE = 0.999
+
+
+def measure_motion(folder: Path, metadata: Metadata) -> Motion:
+    """Speeds of the moving particles, from 12 pairs of frames of each of up to 8 trajectories, evenly spaced.
+
+    Of the training's trajectories, or else those of another split.
+    """
+    split = Split(find_split(folder, *SPLITS))
+    indices = range(0, len(split), -(-len(split) // _TRAJECTORIES))
+    speeds = np.concatenate([_speeds(split, index, metadata) for index in indices] or [np.zeros(1)])
+    pulls = [trajectory_gravity(split.attributes(index), metadata, split.where(index)) for index in indices]
+    squares = [float(np.square(pull).sum()) for pull in pulls if pull is not None]
+    return Motion(
+        rms=float(np.sqrt(np.square(speeds).mean())),
+        largest=float(np.quantile(speeds, _QUANTILE)),
+        gravity=float(np.sqrt(np.mean(squares))) if squares else None,
+    )
+
+
+def _speeds(split: Split, index: int, metadata: Metadata) -> np.ndarray:
+    """Speeds, in length per frame, of the particles that are there in both frames of a pair."""
+    moving = metadata.is_moving(split.particle_type(index))
+    starts = np.unique(np.linspace(0, max(0, split.frames(index) - 2), _PAIRS).astype(int))
+    pairs = [split.read(index, start, start + 2).position[:, moving] for start in starts.tolist()]
+    speeds = [np.linalg.norm(displacements(pair, metadata), axis=-1).ravel() for pair in pairs]
+    every: np.ndarray = np.concatenate(speeds)
+    return np.asarray(every[~np.isnan(every)])

@@ -1,0 +1,141 @@
+"""What a model has seen in its training, and what data hold, in cells and frames: gravity, speeds, particles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import torch
+
+from nmpm.emulator.calibration import channel_values
+from nmpm.emulator.model import UNLIMITED, Emulator
+from nmpm.scene import Interval, Motion, Scene
+
+_SPACING = 1.5
+"""Factor by which the spacing of particles may differ from the training's where the recipe states no range."""
+_WEAK = 0.5
+"""A model that is told gravity is matched to this share of its root mean square, or more."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """A scene of the data in cells and frames of a model.
+
+    Args:
+        gravity: |g| Δt²/h, in cells per frame²; None where it is unknown or zero.
+        rms, largest: Speeds, in cells per frame; None where they are unknown.
+        spacing: Distances between particles to a cell and axis.
+    """
+
+    gravity: float | None
+    rms: float | None
+    largest: float | None
+    spacing: float
+
+    @classmethod
+    def of(cls, scene: Scene, motion: Motion | None, widths: Sequence[float], stride: Fraction) -> Figures:
+        """The figures on cells of some widths (D,), in the data's units, with so many frames of the data for one."""
+        width, frames = mean_width(widths), float(stride)
+        gravity = _gravity_in_cells(scene, widths)
+        if gravity is None and motion and motion.gravity:
+            gravity = motion.gravity * scene.dt**2 / width
+        return cls(
+            gravity=None if gravity is None else gravity * frames**2,
+            rms=motion.rms * frames / width if motion else None,
+            largest=motion.largest * frames / width if motion else None,
+            spacing=width / scene.particle_spacing,
+        )
+
+
+@dataclass(frozen=True)
+class Experience:
+    """The figures of a model's training.
+
+    Args:
+        gravity: Weakest and strongest gravity that counts as matched, in cells per frame²; None where it is unknown or
+            zero.
+        rms: Root mean square speed in filled cells, in cells per frame; None for an uncalibrated model.
+        fastest: Speed up to which the model is calibrated, likewise.
+        spacing: Distances between particles to a cell and axis, in the scene of the training.
+        spacings: Fewest and most of them.
+    """
+
+    gravity: Interval | None
+    rms: float | None
+    fastest: float | None
+    spacing: float
+    spacings: Interval
+
+    @classmethod
+    def of(cls, emulator: Emulator) -> Experience:
+        """The figures of a model, from its scene and its normalisation statistics."""
+        scene, stated = emulator.scene, emulator.recipe.particles_per_cell
+        spacing = mean_width(emulator.grid.spacing) / scene.particle_spacing
+        few, most = (n ** (1 / scene.dim) for n in stated) if stated else (spacing / _SPACING, spacing * _SPACING)
+        spacings = min(few, spacing), max(most, spacing)
+        return cls(_gravities(emulator), _rms_speed(emulator), _fastest(emulator), spacing, spacings)
+
+    def motion_factor(self, data: Figures) -> float:
+        """Gravity over the nearest that the model has seen; without any, speeds over the model's; 1 if unknown."""
+        if data.gravity and self.gravity:
+            return data.gravity / clamp(data.gravity, *self.gravity)
+        return data.rms / self.rms if data.rms and self.rms else 1.0
+
+    def speed_excess(self, data: Figures) -> float:
+        """The data's largest speed over that up to which the model is calibrated; 0 where either is unknown."""
+        return data.largest / self.fastest if data.largest and self.fastest else 0.0
+
+
+def clamp(value: float, low: float, high: float) -> float:
+    """The value, or the nearer end of an interval that it is not in."""
+    return max(low, min(value, high))
+
+
+def mean_width(widths: Sequence[float]) -> float:
+    """The geometric mean of a cell's widths; exactly their value where they are the same."""
+    return widths[0] if len(set(widths)) == 1 else math.prod(widths) ** (1 / len(widths))
+
+
+def _gravity_in_cells(scene: Scene, widths: Sequence[float]) -> float | None:
+    if scene.gravity is None or not any(scene.gravity):
+        return None
+    return math.hypot(*(g / h for g, h in zip(scene.gravity, widths, strict=True))) * scene.dt**2
+
+
+def _gravities(emulator: Emulator) -> Interval | None:
+    if not emulator.scene.gravity_varies:
+        only = _gravity_in_cells(emulator.scene, emulator.grid.spacing)
+        return None if only is None else (only, only)
+    rms = math.sqrt(_mean_square(emulator, "gravity_"))
+    if not emulator.calibrated or not rms:
+        return None
+    # The limits are the sampled range, widened by half of it on either side.
+    low, high = (channel_values(emulator, limit, "gravity_") for limit in (emulator.input_low, emulator.input_high))
+    sampled = torch.maximum((3 * low + high).abs(), (low + 3 * high).abs()) / 4
+    return _WEAK * rms, max(rms, float(sampled[sampled < UNLIMITED / 4].amax()))
+
+
+def _rms_speed(emulator: Emulator) -> float | None:
+    """The root mean square speed where there is material: velocities are zero in empty cells."""
+    names = emulator.scene.materials
+    filled = sum(float(channel_values(emulator, emulator.input_mean, f"{name}.volume").sum()) for name in names)
+    square = sum(_mean_square(emulator, f"{name}.velocity_") for name in names)
+    return math.sqrt(square / filled) if emulator.calibrated and filled > 0 and square > 0 else None
+
+
+def _fastest(emulator: Emulator) -> float | None:
+    """The largest component of a velocity that is not clipped."""
+    limits = [
+        channel_values(emulator, limit, f"{name}.velocity_").abs()
+        for name in emulator.scene.materials
+        for limit in (emulator.input_low, emulator.input_high)
+    ]
+    limit = torch.cat(limits)
+    return float(limit[limit < UNLIMITED / 2].amax()) if bool((limit < UNLIMITED / 2).any()) else None
+
+
+def _mean_square(emulator: Emulator, prefix: str) -> float:
+    mean, std = (channel_values(emulator, each, prefix) for each in (emulator.input_mean, emulator.input_std))
+    return float((mean.square() + std.square()).sum())

@@ -1,0 +1,181 @@
+"""Similarity: cells and a stride in which a foreign scene is, for a model, one like its own.
+
+The network knows cells and frames only. Two scenes are the same problem where g Δt²/h, in cells per frame squared, the
+particles per cell, and speeds in cells per frame agree, whatever the units of length and time. `find_match` chooses the
+size of the cells, h, and how many frames of the data are one of the model.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+from nmpm.emulator.experience import Experience, Figures, clamp, mean_width
+from nmpm.emulator.match_report import MatchReport
+from nmpm.emulator.material_names import match_materials
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.recipe import EmulatorRecipe
+from nmpm.emulator.similar_grid import SimilarGrid, similar_grid
+from nmpm.errors import ConfigError
+from nmpm.scene import Motion as Motion
+from nmpm.scene import Reading, Scene
+
+_WHOLE = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20)
+STRIDES = tuple(Fraction(k) for k in _WHOLE) + tuple(Fraction(1, k) for k in _WHOLE[1:])
+"""Frames of the data for one of the model that are tried."""
+_SHIFTS = tuple(1 + 0.002 * i for i in sorted(range(-20, 21), key=abs))
+"""Factors on the best size of cells that are tried, for walls as in the model's scenes."""
+_SPEED_COST, _SPACING_COST, _STRIDE_COST, _WALL_COST = 0.25, 0.05, 0.02, 0.01
+"""Weights of the other squared logarithms beside that of gravity, and of misfits of walls."""
+_MOST_CELLS = 4_000_000
+
+
+@dataclass(frozen=True)
+class Match:
+    """How a model takes foreign data.
+
+    Args:
+        recipe: The model's form over the data's scene, in the data's units.
+        reading: How the data are read for it.
+        lines: Cells, frames, gravity, particles and materials, a line each, to be checked by eye.
+        warnings: What could not be matched, with its factor.
+    """
+
+    recipe: EmulatorRecipe
+    reading: Reading
+    lines: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def find_match(
+    emulator: Emulator,
+    scene: Scene,
+    motion: Motion | None = None,
+    materials: Mapping[str, str] | None = None,
+    stride: Fraction | None = None,
+    strict: bool = False,
+    names: tuple[str, str] = ("the model", "the data"),
+) -> Match:
+    """The cells, the stride and the materials with which a model takes the scenes of foreign data.
+
+    A scene in the model's units, with its time step and gravity and a domain of whole cells, keeps the model's cells,
+    as `EmulatorRecipe.over` does.
+
+    Args:
+        emulator: The model.
+        scene: The data's, in units of their own.
+        motion: How the data move, where that has been measured.
+        materials: The model's material by the data's name; those left out are told by their names.
+        stride: Frames of the data for one of the model, k or 1/k; the best of `STRIDES` if left out.
+        strict: Whether to refuse what could not be matched.
+        names: Of model and data, for messages.
+
+    Raises:
+        ConfigError: if the numbers of axes differ, the materials cannot be told, the grid would be too large, or, in
+            strict mode, there would be a warning.
+    """
+    if scene.dim != emulator.scene.dim:
+        raise ConfigError(f"{names[0]} has {emulator.scene.dim} axes, {names[1]} {scene.dim}: no model for these data.")
+    if stride is not None and (stride <= 0 or 1 not in (stride.numerator, stride.denominator)):
+        raise ConfigError(f"stride = {stride}: give k or 1/k frames of the data for one of the model, k whole.")
+    mapping = match_materials(emulator.scene.materials, scene.materials, materials or {}, names)
+    search = _Search(emulator, _with_channels_of(emulator.scene, scene), motion, Experience.of(emulator))
+    recipe, chosen_stride = search.same_units(stride) or search.best(STRIDES if stride is None else (stride,), names)
+    figures = Figures.of(scene, motion, recipe.grid.spacing, chosen_stride)
+    report = MatchReport(emulator.recipe, recipe, scene, chosen_stride, search.seen, figures, names)
+    warnings = tuple(report.warnings())
+    if strict and warnings:
+        raise ConfigError(f"{' '.join(warnings)} Without strict these are warnings.")
+    differing = {name: to for name, to in mapping.names.items() if to != name}
+    reading = Reading(recipe.scene, differing, chosen_stride.numerator, chosen_stride.denominator)
+    bodies = "; obstacles -> solid channel" if scene.obstacles else ""
+    return Match(recipe, reading, (*report.lines(), f"materials  {mapping}{bodies}"), warnings)
+
+
+def _with_channels_of(model: Scene, scene: Scene) -> Scene:
+    """A scene of the data with the model's materials, fields and channels, in the data's units."""
+    if scene.materials != model.materials:
+        scene = dataclasses.replace(scene, materials=model.materials, densities=model.densities)
+    moving = scene.moving_obstacles or model.moving_obstacles
+    return dataclasses.replace(
+        scene.with_fields_of(model),
+        gravity_varies=scene.gravity_varies or model.gravity_varies,
+        obstacles=scene.obstacles or moving,
+        moving_obstacles=moving,
+    )
+
+
+@dataclass(frozen=True)
+class _Search:
+    """The search for cells and stride.
+
+    Args:
+        emulator: The model.
+        scene: The data's, with the model's channels but units and a domain of its own.
+        motion: The data's.
+        seen: The figures of the model's training.
+    """
+
+    emulator: Emulator
+    scene: Scene
+    motion: Motion | None
+    seen: Experience
+
+    def same_units(self, stride: Fraction | None) -> tuple[EmulatorRecipe, Fraction] | None:
+        """The model's cells for a scene in its units, with its gravity and time step; None for others."""
+        try:
+            return (self.emulator.recipe.over(self.scene), Fraction(1)) if stride in (None, 1) else None
+        except ConfigError:
+            return None
+
+    def best(self, strides: Sequence[Fraction], names: tuple[str, str]) -> tuple[EmulatorRecipe, Fraction]:
+        """The form of the model, and the stride, of the least cost.
+
+        Raises:
+            ConfigError: if it would have too many cells.
+        """
+        recipe = self.emulator.recipe
+        pairs = [(stride, self._scale(stride) * shift) for stride in strides for shift in _SHIFTS]
+        choices = [(stride, similar_grid(recipe, self.scene, scale)) for stride, scale in pairs]
+        stride, grid = min(choices, key=lambda choice: self._cost(*choice))
+        if math.prod(grid.cells) > _MOST_CELLS:
+            raise ConfigError(
+                f"{names[1]} would need {' x '.join(map(str, grid.cells))} cells of {mean_width(grid.widths):.3g}"
+                f" length for {names[0]}, more than {_MOST_CELLS:,}: its bounds {list(self.scene.bounds)} are wide for"
+                f" particles that are {self.scene.particle_spacing:.3g} apart. State narrower ones (data.bounds)."
+            )
+        return self._recipe(grid, stride), stride
+
+    def _scale(self, stride: Fraction) -> float:
+        """Length of the data for one of the model: by gravity, or else by speeds, among spacings that it has seen."""
+        at_one = Figures.of(self.scene, self.motion, self.emulator.grid.spacing, stride)
+        scale = self.seen.spacing / at_one.spacing
+        if at_one.gravity and self.seen.gravity:
+            weakest, strongest = self.seen.gravity
+            scale = clamp(scale, at_one.gravity / strongest, at_one.gravity / weakest)
+        elif at_one.rms and self.seen.rms:
+            scale = at_one.rms / self.seen.rms
+        return clamp(scale, self.seen.spacings[0] / at_one.spacing, self.seen.spacings[1] / at_one.spacing)
+
+    def _cost(self, stride: Fraction, grid: SimilarGrid) -> float:
+        figures = Figures.of(self.scene, self.motion, grid.widths, stride)
+        return (
+            math.log(self.seen.motion_factor(figures)) ** 2
+            + _SPEED_COST * math.log(max(1.0, self.seen.speed_excess(figures))) ** 2
+            + _SPACING_COST * math.log(figures.spacing / self.seen.spacing) ** 2
+            + _STRIDE_COST * math.log(stride) ** 2
+            + _WALL_COST * grid.misfit
+        )
+
+    def _recipe(self, grid: SimilarGrid, stride: Fraction) -> EmulatorRecipe:
+        """The model's form on a grid over the data, without a limit on energy that would not hold there."""
+        recipe, frame = self.emulator.recipe, self.scene.dt * stride.numerator / stride.denominator
+        scene = dataclasses.replace(self.scene, domain=grid.domain, dt=frame)
+        if recipe.scene.walled and not scene.walled:
+            scene = dataclasses.replace(scene, obstacles=True)  # the solid channel is there, and empty
+        conserved = recipe.constraints.energy and scene.gravity_known and scene.is_closed
+        constraints = dataclasses.replace(recipe.constraints, energy=conserved)
+        return dataclasses.replace(recipe, scene=scene, cells=grid.cells, constraints=constraints)
