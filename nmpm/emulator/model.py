@@ -185,7 +185,9 @@ class Emulator(nn.Module):
 
     def matched(self, match: Match) -> Emulator:
         """A copy of weights and statistics for foreign data, see `nmpm.emulator.similarity.find_match`."""
-        return self.rebuilt(match.recipe)
+        from nmpm.emulator.adaptation import adapted  # imported late, as it imports this module
+
+        return adapted(self, match.recipe)
 
     def rebuilt(self, recipe: EmulatorRecipe) -> Emulator:
         """A copy of weights and statistics in an emulator of another recipe whose tensors have the same shapes."""

@@ -36,15 +36,16 @@ def similar_grid(recipe: EmulatorRecipe, scene: Scene, scale: float) -> SimilarG
     """The grid over a scene's bounds with `scale` times as long cells as the model's, in the data's units.
 
     Layers beyond the bounds are as thick as the model's, in cells, at the lower end of an axis, and at least as thick
-    at the upper one. A periodic axis has the number of cells nearest to its period that the network takes.
+    at the upper one. Without layers, and on periodic axes, the cells are the nearest number that the network takes.
     """
     axes = []
     for axis, (bounds, kind, width) in enumerate(zip(scene.bounds, scene.boundary, recipe.grid.spacing, strict=True)):
         takes = _network_takes(recipe, periodic=kind == "periodic")
-        if kind == "periodic":
-            axes.append((bounds, _cells_of_period((bounds[1] - bounds[0]) / (scale * width), takes), 0.0))
+        layers = _layers(recipe, axis, kind)
+        if kind == "periodic" or (kind == "wall" and layers == (0, 0)):
+            axes.append((bounds, _nearest_cells((bounds[1] - bounds[0]) / (scale * width), takes), 0.0))
         else:
-            axes.append(_walled_axis(bounds, scale * width, _layers(recipe, axis, kind), takes))
+            axes.append(_walled_axis(bounds, scale * width, layers, takes))
     domain, cells, misfits = zip(*axes, strict=True)
     widths = tuple((high - low) / n for (low, high), n in zip(domain, cells, strict=True))
     return SimilarGrid(domain, cells, widths, sum(misfits))
@@ -64,8 +65,8 @@ def _network_takes(recipe: EmulatorRecipe, periodic: bool) -> Callable[[int], bo
     return takes
 
 
-def _cells_of_period(cells: float, takes: Callable[[int], bool]) -> int:
-    """The whole number nearest to a period's cells that the network takes."""
+def _nearest_cells(cells: float, takes: Callable[[int], bool]) -> int:
+    """The whole number of cells that the network takes nearest to this one."""
     nearest = range(max(1, math.floor(cells) - _TRIES), math.ceil(cells) + _TRIES)
     return next(filter(takes, sorted(nearest, key=lambda n: abs(math.log(n / cells)))), max(1, round(cells)))
 

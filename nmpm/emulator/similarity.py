@@ -28,8 +28,10 @@ STRIDES = tuple(Fraction(k) for k in _WHOLE) + tuple(Fraction(1, k) for k in _WH
 """Frames of the data for one of the model that are tried."""
 _SHIFTS = tuple(1 + 0.002 * i for i in sorted(range(-20, 21), key=abs))
 """Factors on the best size of cells that are tried, for walls as in the model's scenes."""
-_SPEED_COST, _SPACING_COST, _STRIDE_COST, _WALL_COST = 0.25, 0.05, 0.02, 0.01
+_SPEED_COST, _SPACING_COST, _STRIDE_COST, _WALL_COST = 0.25, 0.1, 0.01, 0.01
 """Weights of the other squared logarithms beside that of gravity, and of misfits of walls."""
+_SAME_UNITS = 4.0
+"""Factor between the distances of particles of scenes that may be in the same unit of length."""
 _MOST_CELLS = 4_000_000
 
 
@@ -126,8 +128,11 @@ class _Search:
 
     def same_units(self, stride: Fraction | None) -> tuple[EmulatorRecipe, Fraction] | None:
         """The model's cells for a scene in its units, with its gravity and time step; None for others."""
+        apart = self.scene.particle_spacing / self.emulator.scene.particle_spacing
+        if stride not in (None, 1) or not 1 / _SAME_UNITS < apart < _SAME_UNITS:
+            return None
         try:
-            return (self.emulator.recipe.over(self.scene), Fraction(1)) if stride in (None, 1) else None
+            return self.emulator.recipe.over(self.scene), Fraction(1)
         except ConfigError:
             return None
 

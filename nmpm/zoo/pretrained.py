@@ -204,7 +204,7 @@ class Pretrained:
         """The same weights for foreign data, in their units: on cells, and at frames, in which they are like its own.
 
             model = Zoo.load("sandramps").fit_to("grains", materials={"big": "sand", "small": "sand"})
-            print("\n".join(model.match.lines))
+            print(*model.match.lines)
 
         Matched are gravity in cells per frame², or speeds where there is none, and the particles per cell. A scene in
         this model's units, with its gravity and time step and a domain of whole cells, keeps the cells.

@@ -48,12 +48,12 @@ def test_over_a_wider_domain_the_same_weights_get_more_cells_of_the_same_size(mo
     assert bool((positions[..., 0] <= 1.74).all())
 
 
-@pytest.mark.parametrize(
-    ("change", "message"), [({"dt": 1.0}, "dt"), ({"domain": ((0.08, 0.97), (0.08, 0.92))}, "whole numbers")]
-)
-def test_scenes_that_a_model_cannot_take_are_refused(model, change, message):
-    with pytest.raises(ConfigError, match=message):
-        model.over(dataclasses.replace(model.scene, **change))
+def test_scenes_unlike_the_models_are_taken_with_a_warning_or_refused(model):
+    sideways = dataclasses.replace(model.scene, gravity=(9.81, 0.0))
+    with pytest.warns(UserWarning, match=r"Gravity of the data points along \[9.81, 0.0\]"):
+        assert model.over(sideways).scene == sideways
+    with pytest.raises(ConfigError, match="turn the data"):
+        model.fit_to(sideways, strict=True)
 
 
 def test_a_model_prints_as_one_line_and_loading_leaves_torchs_random_state_as_it_is(model, root):
