@@ -88,7 +88,7 @@ def test_materials_are_told_by_their_names_or_asked_for():
     match = find_match(emulator, scene)
     assert match.reading.materials == {"Wet grains": "sand", "fluid": "water"}
     assert "proposed" in match.lines[-1]
-    with pytest.raises(ConfigError, match="mud, sand; the model has water, sand.*--materials mud=water,sand=sand"):
+    with pytest.raises(ConfigError, match=r"mud, sand; the model has water, sand.*--materials mud=water,sand=sand"):
         find_match(emulator, box(materials=("mud", "sand")))
     match = find_match(emulator, box(materials=("mud", "sand")), materials={"mud": "sand"})
     assert match.reading.scene.materials == ("water", "sand")
