@@ -93,6 +93,13 @@ def validation_interval(trainer: Trainer, pace: float) -> float:
     return float(max(epochs * batches / trainer.accumulate_grad_batches, 1.0))
 
 
+def lengthen_validation_interval(trainer: Trainer, seconds: float) -> None:
+    """Let at least so many seconds lie between validations, where their interval is stated as a time."""
+    interval = trainer._val_check_time_interval  # type: ignore[attr-defined]  # (Lightning sets it)
+    if interval is not None:
+        trainer._val_check_time_interval = max(interval, seconds)  # type: ignore[attr-defined]
+
+
 def _timers(trainer: Trainer) -> list[Timer]:
     """The timers that limit a training: the trainer's `max_time`, and others among its callbacks."""
     callbacks = trainer.callbacks  # type: ignore[attr-defined]  # (Lightning sets it)

@@ -1,6 +1,7 @@
 """A training says early how far its time reaches, and its validations take a bounded share of it."""
 
 import re
+from types import SimpleNamespace
 
 import lightning
 import pytest
@@ -115,3 +116,14 @@ def test_the_closing_test_is_announced(make_dataset, set_pace, capsys):
     said = capsys.readouterr().out
     # 33 frames of rollouts, and 24 in 10 s
     assert said.startswith("The closing test takes about 0:00:14 (--trainer.limit_test_batches N shortens it).")
+
+
+@pytest.mark.parametrize(("seconds", "interval"), [(2.0, 20.0), (30.0, 150.0)])
+def test_after_a_long_validation_of_the_start_they_come_more_rarely(seconds, interval, monkeypatch):
+    trainer = SimpleNamespace(global_step=0, _val_check_time_interval=20.0, sanity_checking=False, datamodule=None)
+    guard, times = Forecast(), iter((0.0, seconds))
+    guard.on_train_start(trainer, None)
+    monkeypatch.setattr(forecast.time, "monotonic", lambda: next(times))
+    guard.on_validation_start(trainer, None)
+    guard.on_validation_end(trainer, None)
+    assert trainer._val_check_time_interval == interval

@@ -14,7 +14,13 @@ from nmpm._support.collectives import broadcast_from_rank0
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.particles import Window
-from nmpm.training.budget import reserve_time, seconds_left, total_steps, validation_interval
+from nmpm.training.budget import (
+    lengthen_validation_interval,
+    reserve_time,
+    seconds_left,
+    total_steps,
+    validation_interval,
+)
 from nmpm.training.module import EmulatorModule
 
 SKIPPED, MEASURED = 4, 16
@@ -30,7 +36,8 @@ VALIDATION_SHARE = 0.2
 class Forecast(Callback):
     """Measures the pace of a training over some steps. Then, once:
 
-    - if all validations together would take more than `VALIDATION_SHARE` of the time, they get fewer trajectories;
+    - if all validations together would take more than `VALIDATION_SHARE` of the time, they get fewer trajectories; after
+      a validation of the start they keep these, and are further apart if their interval is stated as a time;
     - the steps end early enough for the last validation to be within `max_time`;
     - if `max_time` ends the training before half of its steps, a line says so, what that costs and what to do.
 
@@ -40,7 +47,7 @@ class Forecast(Callback):
     def __init__(self) -> None:
         self._seconds: list[float] = []  # of the steps measured
         self._step, self._since = -1, math.nan
-        self._batch_start = math.nan
+        self._validation_start = self._batch_start = math.nan
         # Seconds of a frame of one trajectory in an evaluation by one process: estimated, and of each batch measured.
         self._estimate: float | None = None
         self._measured: list[float] = []
@@ -60,10 +67,14 @@ class Forecast(Callback):
             self._decide(trainer, pl_module, broadcast_from_rank0(pace, trainer.strategy.root_device))
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._since = math.nan
+        self._since, self._validation_start = math.nan, time.monotonic()
         data = trainer.datamodule  # type: ignore[attr-defined]  # (Lightning sets it)
         if isinstance(data, TrajectoryDataModule) and data.validated is None and not trainer.sanity_checking:
             data.validated = len(data.recordings("valid"))  # a resumed training keeps to it
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self._step == 0 and trainer.global_step == 0 and not math.isnan(self._validation_start):
+            lengthen_validation_interval(trainer, (time.monotonic() - self._validation_start) / VALIDATION_SHARE)
 
     def on_validation_batch_start(self, *_: Any) -> None:
         self._batch_start = time.monotonic()
