@@ -36,8 +36,8 @@ VALIDATION_SHARE = 0.2
 class Forecast(Callback):
     """Measures the pace of a training over some steps. Then, once:
 
-    - if all validations together would take more than `VALIDATION_SHARE` of the time, they get fewer trajectories; after
-      a validation of the start they keep these, and are further apart if their interval is stated as a time;
+    - if all validations together would take more than `VALIDATION_SHARE` of the time, they get fewer trajectories;
+      after one of the start they keep these, and are further apart if their interval is stated as a time;
     - the steps end early enough for the last validation to be within `max_time`;
     - if `max_time` ends the training before half of its steps, a line says so, what that costs and what to do.
 
