@@ -195,6 +195,22 @@ class Window(Batched):
         cut["fields"] = {name: v if v.shape[1] == 1 else v[:, picked] for name, v in self.fields.items()}
         return dataclasses.replace(self, **cut)
 
+    def padded(self, multiple: int) -> Self:
+        """The windows with as much padding as makes N and M multiples of a number, so that shapes repeat."""
+        particles = {"frames": 2, "material": 1, "mask": 1, "present": 2, "volume": 1}
+        obstacles = {"obstacle": 1, "obstacle_mask": 1, "obstacle_share": 1, "obstacle_frames": 2}
+        larger: dict[str, Any] = {
+            name: _extended(getattr(self, name), axis, -getattr(self, name).shape[axis] % multiple)
+            for name, axis in (particles | obstacles).items()
+            if getattr(self, name) is not None
+        }
+        missing = -self.frames.shape[2] % multiple
+        larger["fields"] = {
+            name: _extended(values, 2, missing if values.shape[2] == self.frames.shape[2] else 0)
+            for name, values in self.fields.items()
+        }
+        return dataclasses.replace(self, **larger)
+
     @property
     def recorded(self) -> Tensor:
         """The frames, (B, T, N, D), NaN where a particle is absent."""
@@ -210,6 +226,16 @@ class Window(Batched):
         values = self.fields[name]
         ahead = values if values.shape[1] == 1 else values[:, 2:]
         return ahead.expand(-1, self.frames.shape[1] - 2, self.frames.shape[2])
+
+
+def _extended(values: Tensor, axis: int, by: int) -> Tensor:
+    """Values with the first along an axis repeated at its end so many times, or False in a mask."""
+    shape = list(values.shape)
+    if not by or not shape[axis]:
+        return values
+    shape[axis] = by
+    more = values.new_zeros(shape) if values.dtype == torch.bool else values.narrow(axis, 0, 1).expand(shape)
+    return torch.cat([values, more], dim=axis)
 
 
 def _check_shapes(

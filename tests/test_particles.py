@@ -1,3 +1,5 @@
+import dataclasses
+
 import pytest
 import torch
 from scenes import box, cloud
@@ -38,3 +40,19 @@ def test_a_window_of_a_state_starts_there_and_predicts_nothing():
     assert window.target.shape == (3, 0, 5, 2)
     for name, values in vars(window.initial).items():
         torch.testing.assert_close(values, getattr(start, name), rtol=0, atol=1e-7)
+
+
+def test_padding_to_a_multiple_adds_particles_that_are_not_there():
+    state_ = state()
+    whole = Window.of(dataclasses.replace(state_, fields={"t": torch.rand(3, 5), "angle": torch.rand(3, 1)}))
+    present, share = torch.ones(3, 2, 5, dtype=torch.bool), torch.ones(3, 2)
+    window = dataclasses.replace(whole, present=present, obstacle_share=share).padded(4)
+    shapes = {name: tuple(values.shape) for name, values in tensors(window).items()}
+    assert shapes["frames"] == (3, 2, 8, 2)
+    assert shapes["obstacle"] == (3, 4, 2)
+    assert (shapes["t"], shapes["angle"]) == ((3, 1, 8), (3, 1, 1))
+    assert torch.equal(window.mask, torch.arange(8).expand(3, -1) < 5)
+    assert torch.equal(window.obstacle_mask, torch.arange(4).expand(3, -1) < 2)
+    assert not window.present[..., 5:].any()
+    assert tensors(whole.padded(1)).keys() == tensors(whole).keys()
+    assert whole.padded(5).frames is whole.frames

@@ -6,6 +6,7 @@ import platform
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from nmpm._support.messages import counted, one_line
 from nmpm.errors import ConfigError
@@ -74,3 +75,9 @@ def processor_name() -> str:
         return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor() or platform.machine()
+
+
+def copy_to(values: Tensor, device: torch.device) -> Tensor:
+    """Values on a device; a copy from the CPU to a GPU does not wait for the kernels that are queued there."""
+    pinned = device.type == "cuda" and values.device.type == "cpu"
+    return values.pin_memory().to(device, non_blocking=True) if pinned else values.to(device)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
+from nmpm._support.devices import copy_to
 from nmpm._support.threads import ThreadChoice
 from nmpm.decoders import Decoder
 from nmpm.emulator.bundle import Bundle as Bundle
@@ -172,7 +173,8 @@ class Emulator(nn.Module):
         """
         other = self._with_recipe(dataclasses.replace(self.recipe, scene=self.scene.with_domain_moved(shift)))
         bounds, walls = other.grid.bounds_in_cells(other.scene), wall_fraction(other.scene, other.grid)
-        other._buffers = {**self._buffers, "bounds": bounds.to(self.bounds), "walls": walls.to(self.walls)}
+        placed = {"bounds": bounds.to(self.bounds.dtype), "walls": walls.to(self.walls.dtype)}
+        other._buffers = {**self._buffers, **{name: copy_to(values, self.device) for name, values in placed.items()}}
         return other
 
     def unconstrained(self) -> Emulator:

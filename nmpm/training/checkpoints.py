@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 COMPARED = ("cells", "frames", "transfer", "processor", "decoder")
 """Parts of a recipe that its weights were trained for; constraints and noise may change."""
-UNREPORTED = ("scene", "recompute", "compile")
+UNREPORTED = ("scene", "recompute", "compile", "record")
 """Hyperparameters that are compared elsewhere, or without influence on the result."""
 
 

@@ -23,6 +23,7 @@ from nmpm.metrics import MSE
 from nmpm.particles import Window
 from nmpm.scene import Scene
 from nmpm.training import EmulatorModule
+from tests.emulator.test_emulator_on_meta import WatchCopies
 
 META = torch.device("meta")
 
@@ -94,6 +95,8 @@ def test_steps_and_evaluations_never_leave_the_device_until_figures_are_read(fit
     assert loss.device == META
     loss.backward()
     assert all(weight.grad.device == META for weight in module.parameters())
+    with WatchCopies():  # as steps are recorded
+        module._mean_error(2, module.emulator, short.initial, short)
     assert all(buffer.device == META for name, buffer in module.emulator.named_buffers() if name != "calibrated")
     module.eval()
     with torch.no_grad():

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nmpm._support.devices import copy_to
 from nmpm.data.loading.model_frames import add_frames
 from nmpm.data.loading.presence import find_tracks
 from nmpm.data.loading.recording import Recording
@@ -106,8 +107,8 @@ class PaddedRecordings:
         Rows, first frames and `length` are the data's; the windows' frames are the model's where the recordings have a
         reading.
         """
-        row = _index_tensor(rows, self.frames.device)
-        first = _index_tensor(starts, self.frames.device)
+        row = copy_to(torch.as_tensor(rows), self.frames.device)
+        first = copy_to(torch.as_tensor(starts), self.frames.device)
         between = 1 if self.reading is None else self.reading.between
         frame = first[:, None] + torch.arange(0 if between == 1 else -1, length, device=self.frames.device)
         frame = frame if between == 1 else frame.clamp(min=0)
@@ -115,7 +116,7 @@ class PaddedRecordings:
             window = self._gather_columns(row, frame, slice(particles))
         else:
             tracks = _tracks_in_windows(self.tracks[rows], starts, length, particles)
-            window = self._gather_tracks(row, frame, _index_tensor(tracks, self.frames.device))
+            window = self._gather_tracks(row, frame, copy_to(torch.as_tensor(tracks), self.frames.device))
         unwrap(window.frames, self.scene)
         if self.obstacle_frames is not None:
             window.obstacle_frames = self.obstacle_frames[row[:, None], frame]
@@ -283,12 +284,6 @@ def _stack_volumes(recordings: Sequence[Recording]) -> Tensor | None:
         for recording in recordings
     ]
     return _pad_and_stack([part[None, :, None] for part in parts], [1.0])[0][:, 0, :, 0]
-
-
-def _index_tensor(values: Sequence[int] | np.ndarray, device: torch.device) -> Tensor:
-    """Indices on a device; the copy to a GPU does not wait for the kernels that are queued there."""
-    index = torch.as_tensor(values)
-    return index.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else index.to(device)
 
 
 def _pad_and_stack(parts: Sequence[Tensor], filler: Sequence[float]) -> tuple[Tensor, Tensor]:

@@ -122,7 +122,8 @@ class Recorded:
 
     def __init__(self, predict: Callable[[Sequence[Tensor]], Bundle], inputs: Sequence[Tensor]) -> None:
         self._inputs = [tensor.clone(memory_format=torch.contiguous_format) for tensor in inputs]
-        self._replay, self._bundle = record(lambda: predict(self._inputs), inputs[0].device)
+        with torch.no_grad():
+            self._replay, self._bundle = record(lambda: predict(self._inputs), inputs[0].device)
 
     def __call__(self, inputs: Sequence[Tensor]) -> Bundle:
         """The bundle for inputs of these shapes, in fresh memory."""
@@ -133,21 +134,34 @@ class Recorded:
         return dataclasses.replace(made, position=made.position.clone(), velocity=made.velocity.clone())
 
 
-def record(function: Callable[[], T], device: torch.device) -> tuple[Callable[[], None], T]:
-    """A launch of the kernels that a function runs on a GPU, and its result, whose tensors each launch overwrites."""
+def record(function: Callable[[], T], device: torch.device, pool: Any = None) -> tuple[Callable[[], None], T]:
+    """A launch of the kernels that a function runs on a GPU, and its result, whose tensors each launch overwrites.
+
+    Recordings with the same `pool` of memory overwrite each other's results. Other threads may use the GPU meanwhile.
+    """
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.device(device), torch.no_grad():
+    with torch.cuda.device(device):
         aside = torch.cuda.Stream()
         aside.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(aside):
             for _ in range(_WARM_UP):
                 function()
         torch.cuda.current_stream().wait_stream(aside)
-        with torch.cuda.graph(graph):
-            result = function()
+        try:
+            with torch.cuda.graph(graph, pool=pool, capture_error_mode="thread_local"):
+                result = function()
+        except Exception:
+            _replace_generator(device)
+            raise
 
     def replay() -> None:
         with torch.cuda.device(device):
             graph.replay()
 
     return replay, result
+
+
+def _replace_generator(device: torch.device) -> None:
+    """Give a GPU a new state of random numbers: that of a recording that failed waits for its end for ever."""
+    fresh = torch.Generator(device).graphsafe_get_state()
+    torch.cuda.default_generators[device.index or 0].graphsafe_set_state(fresh)
