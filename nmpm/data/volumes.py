@@ -1,4 +1,4 @@
-"""Volumes of particles of different size, from a field that says how large they are."""
+"""Volumes of particles of different size, from a field that says how large they are, or an attribute of all of them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from typing import Any
 import h5py
 import numpy as np
 
+from nmpm._support.messages import one_line
 from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.hdf5 import check_stored_size, open_hdf5
+from nmpm.errors import DataError
 
 SIZES = ("volume", "radius", "diameter", "size")
 """Names of fields that say how large particles are; the first that a trajectory has counts."""
@@ -46,8 +48,35 @@ def volumes(split: Split, index: int, metadata: Metadata) -> np.ndarray | None:
     return None
 
 
+def stated_volumes(trajectory: Trajectory, particle_volume: float | None, where: str) -> np.ndarray | None:
+    """(N,) volumes of a trajectory's particles by its attribute `particle_volume`, as multiples of the dataset's.
+
+    None where the attribute is missing or the dataset's volume is not known.
+
+    Raises:
+        DataError: naming `where`, if the attribute is not a positive number.
+    """
+    stated = trajectory.attributes.get("particle_volume")
+    if stated is None or particle_volume is None:
+        return None
+    values = np.asarray(stated)
+    if values.shape not in ((), (1,)) or values.dtype.kind not in "iuf" or not 0 < values.item() < np.inf:
+        raise DataError(
+            f"{where}: the attribute particle_volume = {one_line(stated, 60)} should be a positive number, the volume"
+            " of each particle in length ** dim."
+        )
+    return np.full(len(trajectory.particle_type), values.item() / particle_volume)
+
+
 def relative_volumes(trajectory: Trajectory, moving: np.ndarray) -> np.ndarray | None:
-    """(N',) volumes of the (N,) `moving` particles over their mean; None where all are alike or no field has them."""
+    """(N',) volumes of the (N,) `moving` particles over their mean; None where all are alike or no field has them.
+
+    Where the trajectory states its own volume, they are over the dataset's.
+    """
+    dataset = trajectory.metadata.particle_volume if trajectory.metadata is not None else None
+    stated = stated_volumes(trajectory, dataset, "the trajectory")
+    if stated is not None:
+        return np.asarray(stated[moving])
     frames, particles, dim = trajectory.position.shape
     sizes = {name: values for name, values in trajectory.fields.items() if name in SIZES}
     fitting = [name for name in SIZES if name in sizes and sizes[name].shape in ((particles,), (frames, particles))]

@@ -10,11 +10,12 @@ from typing import Any
 from nmpm._support.bounded_files import parse_yaml, read_text
 from nmpm._support.messages import one_line, suggestion
 from nmpm.errors import ConfigError
+from nmpm.sim.mpm.mixture import MpmMixture
 from nmpm.sim.mpm.preset import MpmPreset
 from nmpm.sim.preset import Preset
 from nmpm.sim.sph.preset import SphPreset
 
-SOLVERS: dict[str, type[Preset]] = {kind.solver: kind for kind in (MpmPreset, SphPreset)}
+SOLVERS: dict[str, type[Preset]] = {kind.solver: kind for kind in (MpmPreset, MpmMixture, SphPreset)}
 
 
 def preset_names() -> tuple[str, ...]:
@@ -66,4 +67,18 @@ def preset_from_dict(plain: Mapping[str, Any]) -> Preset:
     solver = str(entries.pop("solver", None))
     if solver not in SOLVERS:
         raise ConfigError(f"solver = {one_line(solver, 80)} is not one of {', '.join(SOLVERS)}.")
-    return SOLVERS[solver].from_dict(entries)
+    return SOLVERS[solver].from_dict(_with_parts_loaded(entries))
+
+
+def _with_parts_loaded(entries: dict[str, Any]) -> dict[str, Any]:
+    """The entries of a mixture with descriptions of its parts in place of their names."""
+    parts = entries.get("parts")
+    if not isinstance(parts, list | tuple):
+        return entries
+    loaded = [
+        part | {"preset": load_preset(part["preset"]).to_dict()}
+        if isinstance(part, dict) and isinstance(part.get("preset"), str)
+        else part
+        for part in parts
+    ]
+    return entries | {"parts": loaded}

@@ -13,7 +13,7 @@ import pytest
 from nmpm.sim import load_preset, preset_names
 
 GOLDEN = Path(__file__).with_name("golden.json")
-FRAMES = {"mls_mpm": 40, "wcsph": 2}
+FRAMES = {"mls_mpm": 40, "mls_mpm_mixture": 40, "wcsph": 2}
 
 
 def summary(name: str) -> dict[str, object]:

@@ -17,7 +17,7 @@ from nmpm.sim.preset import BOUNDARY
 
 FRAMES, COMPARED_FROM = 80, 60
 SPH = [name for name in preset_names() if load_preset(name).solver == "wcsph"]
-MPM = [name for name in preset_names() if name not in SPH]
+MPM = [name for name in preset_names() if load_preset(name).solver == "mls_mpm"]
 FACTORS = (pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow), 4)
 
 

@@ -28,7 +28,7 @@ from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.loading.presence import Presence, find_tracks
 from nmpm.data.statistics import first_moving_particle, first_outside, without_those_gone
 from nmpm.data.times import check_times
-from nmpm.data.volumes import SIZES, mean_volume, volumes
+from nmpm.data.volumes import SIZES, mean_volume, stated_volumes, volumes
 from nmpm.errors import DataError
 from nmpm.scene import Reading, Scene
 
@@ -71,7 +71,8 @@ class RecordingReader:
         Args:
             trajectory: The trajectory, with its fields as `read_fields` gives them.
             where: Names it in errors.
-            volume: (N,) volumes of its particles, as multiples of the scene's `particle_volume`; None for 1.
+            volume: (N,) volumes of its particles, as multiples of the scene's `particle_volume`; None for 1, or what
+                its attribute `particle_volume` states.
             ids: (T, N) numbers that tell particles apart that share a column; None where none do.
 
         Raises:
@@ -91,6 +92,7 @@ class RecordingReader:
             moving[moving] = presence.ever
             position = presence.fill(position[:, presence.ever])
         obstacles = self._obstacles(trajectory.position, obstacle)
+        volume = stated_volumes(trajectory, self.scene.particle_volume, where) if volume is None else volume
         return Recording(
             frames=torch.from_numpy(np.ascontiguousarray(position)),
             material=torch.from_numpy(self._materials(types[moving], where)),

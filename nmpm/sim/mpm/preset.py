@@ -110,9 +110,14 @@ class MpmPreset(Preset):
         return (self.box[0][1] - self.box[0][0]) / self.cells
 
     @property
+    def wall_layer(self) -> float:
+        """Cells beyond the box that particles get into: one and a half where walls hold what touches them."""
+        return 0.0 if Walls(self.walls) is Walls.SEPARATE else 1.5
+
+    @property
     def reach(self) -> tuple[Interval, ...]:
-        """The box, and a cell and a half beyond it where walls hold what touches them."""
-        layer = 0.0 if Walls(self.walls) is Walls.SEPARATE else 1.5 * self.cell_size
+        """The box and its wall layer."""
+        layer = self.wall_layer * self.cell_size
         ends = ((low - layer, high + layer) for low, high in self.box)
         return tuple(_snap(pair, edges) for pair, edges in zip(ends, self.domain, strict=True))
 
