@@ -111,7 +111,7 @@ class Window(Batched):
         obstacle_frames: (B, T, M, D) positions of obstacles in each frame; None where no obstacle moves. `obstacle`
             has those of the second frame.
         observed: (B, T) bool, whether each frame was recorded; the others are interpolated and count in no error. None
-            where all were. The second frame always was.
+            where all were. The second frame always was. The same in all scenes.
 
     Raises:
         ValueError: if the shapes do not fit together.
@@ -213,13 +213,30 @@ class Window(Batched):
 
     @property
     def recorded(self) -> Tensor:
-        """The frames, (B, T, N, D), NaN where a particle is absent."""
+        """The frames, (B, T, N, D), NaN where a particle is absent; those that were not observed are interpolated."""
         return self.frames if self.present is None else self.frames.where(self.present.unsqueeze(-1), torch.nan)
 
     @property
     def target(self) -> Tensor:
         """The frames to predict, (B, T - 2, N, D)."""
         return self.frames[:, 2:]
+
+    @property
+    def observed_targets(self) -> list[int]:
+        """Indices of the frames to predict that were observed."""
+        count = self.frames.shape[1] - 2
+        return list(range(count)) if self.observed is None else self.observed[:, 2:].all(0).nonzero()[:, 0].tolist()
+
+    def at_observed(self) -> Self:
+        """The frames that were observed, as a window of the data's frames; its start has the same velocity."""
+        if self.observed is None:
+            return self
+        picked = self.observed_targets
+        between, window = picked[0] + 1 if picked else 1, self.pick_frames([0, 1, *(frame + 2 for frame in picked)])
+        for frames in (window.frames, window.obstacle_frames):
+            if frames is not None:
+                frames[:, 0] = frames[:, 1] - between * (frames[:, 1] - frames[:, 0])
+        return dataclasses.replace(window, gravity=between**2 * self.gravity, observed=None)
 
     def field_target(self, name: str) -> Tensor:
         """A field at the frames to predict, (B, T - 2, N)."""

@@ -48,7 +48,8 @@ class Prescribed(Batched):
     def of(cls, window: Window) -> Self | None:
         """What rollouts of a window are given; None where all of its particles are always there, and no obstacle moves.
 
-        Of the window's positions only those of entering particles are used.
+        Of the window's positions only those of entering particles are used. Between frames of the data, particles and
+        obstacles are where the window has them, interpolated.
         """
         if window.present is None:
             return None if window.obstacle_frames is None else cls(obstacle=window.obstacle_frames)

@@ -58,12 +58,13 @@ class Comparison(nn.Module):
         scene: Gives gravity and walls for the free fall.
         metrics: What to compute, an `MSE` among them; copied, so that one list serves several comparisons.
         bundle: Frames that the model predicts at once: particles that enter count from the start of the next bundle on.
+        every: Frames of the data per frame of the model, where it skips some: horizons count frames of the data.
 
     Raises:
         ConfigError: if there is not exactly one `MSE`, by which checkpoints are chosen.
     """
 
-    def __init__(self, scene: Scene, metrics: Sequence[RolloutMetric], bundle: int = 1) -> None:
+    def __init__(self, scene: Scene, metrics: Sequence[RolloutMetric], bundle: int = 1, every: int = 1) -> None:
         super().__init__()
         if sum(isinstance(metric, MSE) for metric in metrics) != 1:
             raise ConfigError("model.metrics needs nmpm.metrics.MSE once: the best checkpoint is chosen by it.")
@@ -75,6 +76,12 @@ class Comparison(nn.Module):
                 for kind in PREDICTORS
             }
         )
+        self.count_every(every)
+
+    def count_every(self, every: int) -> None:
+        """Count so many frames of the data per frame of the model from now on."""
+        for metric in self.errors.values():
+            metric.every = every
 
     @property
     def errors(self) -> Mapping[str, MSE]:
@@ -90,7 +97,7 @@ class Comparison(nn.Module):
         return dict(self._by_predictor())["model"]
 
     def update(self, window: Window, predicted: Tensor, fields: Mapping[str, Tensor] | None = None) -> None:
-        """Add whole trajectories and the model's rollouts of them.
+        """Add whole trajectories and the model's rollouts of them, of which the frames that were observed count.
 
         Args:
             window: The trajectories, of T frames.
@@ -102,8 +109,13 @@ class Comparison(nn.Module):
             "still": predict_from_entries(still, window, self.bundle),
             "free_fall": predict_from_entries(partial(free_fall, self.scene), window, self.bundle),
         }
-        window = with_predicted(window, self.bundle)
-        self.field_errors.update(window, fields or {})
+        window, fields = with_predicted(window, self.bundle), fields or {}
+        if window.observed is not None:
+            picked = window.observed_targets
+            rollouts = {kind: path[:, picked] for kind, path in rollouts.items()}
+            fields = {name: values[:, picked] for name, values in fields.items()}
+            window = window.at_observed()
+        self.field_errors.update(window, fields)
         for kind, metrics in self._by_predictor():
             for metric in metrics:
                 metric.update(window, rollouts[kind])

@@ -60,8 +60,11 @@ class Measures:
 def measure_errors(scene: Scene, window: Window, predicted: Tensor, measures: Measures) -> dict[str, float]:
     """Errors of a prediction (1, T, N, D) of the only scene of a window; all positions that count are finite.
 
+    Where the data have only some of the model's frames, these count, and horizons are in frames of the data.
     Of particles that enter and leave, those that are present count, and energies and shapes are left out.
     """
+    if window.observed is not None:
+        window, predicted = window.at_observed(), predicted[:, window.observed_targets]
     moving = window.mask[0]
     material = window.material[0, moving]
     volume = None if window.volume is None else window.volume[0, moving].double()

@@ -27,7 +27,7 @@ class RolloutMetric(Metric, ABC):
         """Add rollouts.
 
         Args:
-            window: B recorded trajectories of T + 2 frames.
+            window: B recorded trajectories of T + 2 frames, of the data where these have only some of the model's.
             predicted: (B, T, N, D) positions in domain length, from the window's first two frames.
         """
 

@@ -41,6 +41,9 @@ class MSE(RolloutMetric):
 
     Args:
         horizons: Frames h at which the MSE is reported, beside the full rollout.
+
+    Attributes:
+        every: Frames of the data, which horizons count, per frame of the rollouts.
     """
 
     squared: list[Tensor] | Tensor  # one tensor once gathered from several processes
@@ -48,7 +51,7 @@ class MSE(RolloutMetric):
 
     def __init__(self, horizons: Sequence[int] = (1, 8, 32, 100)) -> None:
         super().__init__()
-        self.horizons = tuple(horizons)
+        self.horizons, self.every = tuple(horizons), 1
         self.add_state("squared", default=[], dist_reduce_fx="cat")
         self.add_state("lengths", default=[], dist_reduce_fx="cat")
 
@@ -90,7 +93,8 @@ class MSE(RolloutMetric):
         return {name: torch.tensor(value, dtype=torch.float32) for name, value in means.items()}
 
     def _at_horizons(self, curve: Tensor) -> dict[str, float]:
-        reached = {f"mse@{h}": curve[:h] for h in self.horizons if h <= len(curve)} | {"mse": curve}
+        ends = {h: h // self.every for h in self.horizons}
+        reached = {f"mse@{h}": curve[:end] for h, end in ends.items() if 0 < end <= len(curve)} | {"mse": curve}
         with_particles = {name: values[values != _EMPTY] for name, values in reached.items()}
         return {name: float(values.mean()) for name, values in with_particles.items() if len(values)}
 

@@ -12,6 +12,7 @@ from nmpm.emulator import Emulator, Prescribed, Rollout, predict_rollout
 from nmpm.evaluation.comparison import Comparison
 from nmpm.metrics import MSE, RolloutMetric, overall_error
 from nmpm.particles import Window
+from nmpm.scene import Reading
 from nmpm.training.backpropagation import MOST_PARTS, on_threads, split_rows
 from nmpm.training.preflight import OVERALL
 
@@ -29,6 +30,7 @@ class EvaluatedModule(LightningModule):
             numbers change results by rounding.
         threads: How many threads compute them; None for one each. Changes no result.
         compiled: Whether torch compiles the network, so that batches are not computed in parts.
+        reading: How the data are read for the emulator; errors then count frames of the data.
     """
 
     def __init__(self, emulator: Emulator, horizon: int, metrics: Sequence[RolloutMetric] | None) -> None:
@@ -37,10 +39,17 @@ class EvaluatedModule(LightningModule):
         self.parts: int | None = None
         self.threads: int | None = None
         self.compiled = False
+        self.reading: Reading | None = None
         reported = [MSE()] if metrics is None else list(metrics)
         cheap = [metric for metric in reported if metric.cheap]
         self.valid_errors = Comparison(emulator.scene, cheap, emulator.frames)
         self.test_errors = Comparison(emulator.scene, reported, emulator.frames)
+
+    def setup(self, stage: str) -> None:  # noqa: ARG002
+        """Adopt the datamodule's reading."""
+        self.reading = getattr(getattr(self.trainer, "datamodule", None), "reading", None)
+        for errors in (self.valid_errors, self.test_errors):
+            errors.count_every(1 if self.reading is None else self.reading.every)
 
     def validation_step(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
         predicted = self._predict(batch)
@@ -86,7 +95,7 @@ class EvaluatedModule(LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         errors = self.valid_errors.compute()
-        overall = overall_error(errors, self.horizon)
+        overall = overall_error(errors, self.horizon if self.reading is None else self.reading.elapsed(self.horizon))
         self.log_dict({f"valid/{name}": value for name, value in (errors | {OVERALL: overall}).items()})
 
     def on_test_epoch_end(self) -> None:

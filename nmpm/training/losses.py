@@ -2,6 +2,8 @@
 
 The position errors of each window and bundle may be raised to a power below 1, so that splashes, whose errors nothing
 can reduce much, do not drown what can be learnt elsewhere.
+
+Where data have only some of the frames, these alone count; a bundle without any has no error.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ _FLOOR = 1e-4
 
 @dataclass(frozen=True)
 class TrainingError:
-    """The position error, with the density error at the last frame of each bundle.
+    """The position error, with the density error at the last frame of each bundle, of those that were observed.
 
     Args:
         density_weight: Weight of the density error beside the position error in cells².
@@ -49,11 +51,13 @@ class TrainingError:
         """
         target = window.target[:, : predicted.shape[1]]
         check_comparable(predicted, target, frames)
-        last, there = slice(frames - 1, None, frames), None
-        if window.present is not None:
+        last: tuple[slice | Tensor, ...] = (slice(None), slice(frames - 1, None, frames))
+        there = None
+        if _some_are_missing(window):
             counts = counted(window, predicted.shape[1], frames)
             squared = grid.to_cell_displacement(predicted - target, predicted.dtype).square().mean(-1)
-            error, there = _tempered_mean(squared, counts, frames, self.power), counts[:, last]
+            last = last if window.observed is None else _last_observed(window.observed[:, 2:], predicted, frames)
+            error, there = _tempered_mean(squared, counts, frames, self.power), counts[last]
         elif self.power == 1:
             error = position_error(predicted, target, window.mask, grid)
         else:
@@ -61,15 +65,37 @@ class TrainingError:
             error = tempered_error(errors, window.mask, self.power)
         if not self.density_weight:
             return error
-        density = density_error(predicted[:, last], target[:, last], window, scene, grid, there)
+        density = density_error(predicted[last], target[last], window, scene, grid, there)
         return error + self.density_weight * density
 
 
 def counted(window: Window, frames: int, bundle: int) -> Tensor:
-    """The particles whose errors count: `mask` (B, N), or (B, frames, N) of bundles where some enter or leave."""
-    if window.present is None:
+    """The particles whose errors count: `mask` (B, N), or (B, frames, N) where some are missing, or frames are."""
+    if not _some_are_missing(window):
         return window.mask
-    return predicted_particles(window.present, bundle)[:, :frames] & window.mask.unsqueeze(1)
+    counts = window.mask.unsqueeze(1)
+    if window.present is not None:
+        counts = counts & predicted_particles(window.present, bundle)[:, :frames]
+    return counts if window.observed is None else counts & window.observed[:, 2 : 2 + frames, None]
+
+
+def _some_are_missing(window: Window) -> bool:
+    """Whether particles enter or leave, or some frames were not observed."""
+    return window.present is not None or window.observed is not None
+
+
+def _last_observed(observed: Tensor, predicted: Tensor, bundle: int) -> tuple[Tensor, Tensor]:
+    """Indices (B, 1) and (B, K) of the last frame of each bundle that was observed; the last one if none was.
+
+    Args:
+        observed: (B, T) whether each frame was, T at least that of `predicted`.
+        predicted: (B, K m, …), m frames to a bundle.
+        bundle: m.
+    """
+    batch, frames = predicted.shape[:2]
+    backwards = observed[:, :frames].unflatten(1, (-1, bundle)).flip(2).int()
+    ends = torch.arange(bundle - 1, frames, bundle, device=observed.device)
+    return torch.arange(batch, device=observed.device).unsqueeze(1), ends - backwards.argmax(2)
 
 
 def _tempered_mean(values: Tensor, counts: Tensor, frames: int, power: float) -> Tensor:
@@ -98,7 +124,7 @@ def field_error(
         if name in window.fields:
             target = window.field_target(name)[:, : values.shape[1]]
             squared = ((values - target) / spread[name]).square()
-            if window.present is not None:
+            if _some_are_missing(window):
                 total = total + _tempered_mean(squared, counted(window, values.shape[1], frames), frames, power)
                 continue
             errors = _bundle_means(squared, window.mask, frames)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from itertools import islice
@@ -169,6 +170,7 @@ class EmulatorModule(EvaluatedModule):
 
     def setup(self, stage: str) -> None:
         """Raise ConfigError if data, model or metrics do not suit each other; warn of fields that are ignored."""
+        super().setup(stage)
         data = getattr(self.trainer, "datamodule", None)
         scene, horizon = getattr(data, "scene", None), getattr(data, "horizon", None)
         if isinstance(scene, Scene):
@@ -291,10 +293,11 @@ class EmulatorModule(EvaluatedModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def bundles(self, progress: float) -> int:
-        """Number of bundles that a step unrolls once this share of the training is over."""
+        """Number of bundles that a step unrolls once this share of the training is over; one frame is observed."""
         if progress >= self.unroll_growth:
             return self.unroll
-        return 1 + int((self.unroll - 1) * progress / self.unroll_growth)
+        least = 1 if self.reading is None else math.ceil(self.reading.between / self.emulator.frames)
+        return max(min(least, self.unroll), 1 + int((self.unroll - 1) * progress / self.unroll_growth))
 
     def _progress(self) -> float:
         """Share of the training that is over, by steps or by the clock; 1 where the number of bundles is constant."""

@@ -108,7 +108,8 @@ class ReportWriter(Callback):
         _write_report(folder, figures)
         self._print_progress()
         _print_table(f"{figures['dataset']}: test", figures["test"])
-        _write_curves(folder / "errors.csv", {kind: curves for kind, (_, curves) in errors.items()})
+        every = 1 if pl_module.reading is None else pl_module.reading.every
+        _write_curves(folder / "errors.csv", {kind: curves for kind, (_, curves) in errors.items()}, every)
         if self._first_rollout is not None:
             trajectories = labelled_trajectories(pl_module.emulator.scene, *self._first_rollout)
             write_snapshots(trajectories, folder / "rollout.png")
@@ -183,11 +184,14 @@ def _write_report(folder: Path, figures: Mapping[str, Any]) -> None:
         part.write_text(json.dumps(figures, indent=1) + "\n")
 
 
-def _write_curves(path: Path, curves: Mapping[str, list[Tensor]]) -> None:
-    """Mean over trajectories of the squared error at each frame that all of them reach, a column per predictor."""
+def _write_curves(path: Path, curves: Mapping[str, list[Tensor]], every: int) -> None:
+    """Mean over trajectories of the squared error at each frame that all of them reach, a column per predictor.
+
+    Frames are those of the data, of which the model predicts each `every`-th.
+    """
     frames = min(len(curve) for rows in curves.values() for curve in rows)
     means = torch.stack([torch.stack([curve[:frames] for curve in rows]).mean(0) for rows in curves.values()], dim=1)
-    lines = [["frame", *curves], *([str(frame), *map(str, row)] for frame, row in enumerate(means.tolist(), 1))]
+    lines = [["frame", *curves], *([str(frame * every), *map(str, row)] for frame, row in enumerate(means.tolist(), 1))]
     with atomic_write(path) as part:
         part.write_text("".join(",".join(line) + "\n" for line in lines))
 
