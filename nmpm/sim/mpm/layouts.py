@@ -1,7 +1,7 @@
 """Initial states of the material point method: rectangular blocks of particles, and ramps.
 
-Each block has one velocity. Ramps are slanted bars in the box that do not move, after the setting of DeepMind's
-WaterRamps and SandRamps scenes.
+Each block has one velocity. Ramps are slanted bars, slabs in three dimensions, in the box that do not move, after the
+setting of DeepMind's WaterRamps and SandRamps scenes.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ _BLOCK_ATTEMPTS = 10_000
 _RESTARTS = 20
 _RAMP_ATTEMPTS = 500
 _OUTLINE = 96  # points on a bar's outline by which its distance from others is judged
+_SURFACE = 12  # points along each side of a slab, likewise
 
 
 Extent = tuple[Array, Array]
@@ -132,46 +133,62 @@ def _block_sides(sizes: Array, aspect: tuple[float, float], dim: int, rng: np.ra
 
 @dataclass(frozen=True)
 class SimulatedRamp(Obstacle):
-    """A bar: a rectangle about a centre (x, y), its longer side turned by an angle from the x axis, in radians."""
+    """A bar: a rectangle about a centre (x, y), its longer side turned by an angle from the x axis, in radians.
 
-    centre: tuple[float, float]
+    In three dimensions, with a centre (x, y, z), it has a level width, and is turned from the x to the z axis as well.
+    """
+
+    centre: tuple[float, ...]
     length: float
     thickness: float
     angle: float
+    width: float = 0.0
+    turn: float = 0.0
 
     @property
     def _axes(self) -> Array:
-        """(2, 2) unit vectors along and across the bar, as rows."""
+        """(D, D) unit vectors along and across the bar, and along its width, as rows."""
         cos, sin = math.cos(self.angle), math.sin(self.angle)
-        return np.array([[cos, sin], [-sin, cos]])
+        if len(self.centre) == 2:
+            return np.array([[cos, sin], [-sin, cos]])
+        x, z = math.cos(self.turn), math.sin(self.turn)
+        return np.array([[cos * x, sin, cos * z], [-sin * x, cos, -sin * z], [-z, 0.0, x]])
+
+    @property
+    def _sides(self) -> tuple[float, ...]:
+        return (self.length, self.thickness, self.width)[: len(self.centre)]
 
     @property
     def _half(self) -> Array:
-        return np.array([self.length, self.thickness]) / 2
+        return np.array(self._sides) / 2
 
     def distance(self, points: Array) -> Array:
-        """(K,) signed distance of points (K, 2) from the bar, negative inside."""
+        """(K,) signed distance of points (K, D) from the bar, negative inside."""
         beyond = np.abs((points - np.array(self.centre)) @ self._axes.T) - self._half
         outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
         return np.asarray(outside + np.minimum(beyond.max(axis=-1), 0.0))
 
     def moved(self, shift: Array) -> Self:
-        """The same bar shifted by (2,), in length."""
-        x, y = self.centre
-        return replace(self, centre=(x + float(shift[0]), y + float(shift[1])))
+        """The same bar shifted by (D,), in length."""
+        return replace(self, centre=tuple(x + float(by) for x, by in zip(self.centre, shift, strict=True)))
 
     def particles(self, spacing: float) -> Array:
-        """(M, 2) a lattice that fills the bar, parallel to its sides, about `spacing` apart."""
-        numbers = ((side, max(1, round(side / spacing))) for side in (self.length, self.thickness))
-        along, across = ((np.arange(number) + 0.5) / number * side - side / 2 for side, number in numbers)
-        local = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1).reshape(-1, 2)
-        return np.asarray(np.array(self.centre) + local @ self._axes)
+        """(M, D) a lattice that fills the bar, parallel to its sides, about `spacing` apart."""
+        numbers = ((side, max(1, round(side / spacing))) for side in self._sides)
+        places = [(np.arange(number) + 0.5) / number * side - side / 2 for side, number in numbers]
+        return self._turned(np.stack(np.meshgrid(*places, indexing="ij"), axis=-1).reshape(-1, len(places)))
 
     def outline(self) -> Array:
-        """(K, 2) points all along the sides, corners included."""
+        """(K, D) points all along the sides, corners included; of a slab also inside."""
+        if len(self.centre) == 3:
+            unit = np.stack(np.meshgrid(*[np.linspace(-1, 1, _SURFACE)] * 3, indexing="ij"), axis=-1)
+            return self._turned(unit.reshape(-1, 3) * self._half)
         corners = self._half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
         along = np.linspace(0, 4, _OUTLINE + 1)[:-1]
-        local = np.stack([np.interp(along, np.arange(5), corners[:, axis]) for axis in range(2)], axis=-1)
+        return self._turned(np.stack([np.interp(along, np.arange(5), corners[:, axis]) for axis in range(2)], axis=-1))
+
+    def _turned(self, local: Array) -> Array:
+        """Points (K, D) along the bar's axes from its centre, in the box."""
         return np.asarray(np.array(self.centre) + local @ self._axes)
 
 
@@ -185,6 +202,7 @@ class RampRanges:
         thickness: Of all.
         angle: Least and largest slope, in degrees; to the left or to the right with equal chances.
         gap: Least distance between them, from the box's sides, and from blocks.
+        width: Least and largest level width, in three dimensions, where ramps face any direction.
     """
 
     number: tuple[int, int]
@@ -192,15 +210,20 @@ class RampRanges:
     thickness: float
     angle: tuple[float, float]
     gap: float
+    width: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         check_numbers(self, "ramps.", positive=("length", "thickness"), at_least_0=("number", "angle", "gap"))
+        if self.width is not None:
+            check_numbers(self, "ramps.", positive=("width",))
         check(self.angle[1] <= 90, f"ramps.angle = {list(self.angle)} is not within 0 and 90.")
         check(self.thickness <= self.length[0], f"ramps.thickness = {self.thickness} is more than the length.")
 
     def max_particles(self, spacing: float) -> int:
         """Upper bound of the particles that the ramps of a scene are made of."""
-        return self.number[1] * max(1, round(self.length[1] / spacing)) * max(1, round(self.thickness / spacing))
+        sides = self.length[1], self.thickness, *(() if self.width is None else self.width[1:])
+        of_one: int = math.prod(max(1, round(side / spacing)) for side in sides)
+        return self.number[1] * of_one
 
     def draw(
         self, box: tuple[Interval, ...], occupied: Sequence[Extent], rng: np.random.Generator
@@ -227,8 +250,10 @@ class RampRanges:
             if len(placed) == number:
                 return tuple(placed)
             angle = math.radians(rng.uniform(*self.angle)) * (1 if rng.random() < 0.5 else -1)
-            x, y = rng.uniform(low, high).tolist()
-            drawn = SimulatedRamp((x, y), float(rng.uniform(*self.length)), self.thickness, angle)
+            centre = tuple(rng.uniform(low, high).tolist())
+            drawn = SimulatedRamp(centre, float(rng.uniform(*self.length)), self.thickness, angle)
+            if self.width is not None:
+                drawn = replace(drawn, width=rng.uniform(*self.width), turn=rng.uniform(0, math.pi))
             outline = drawn.outline()
             inside = np.all((outline >= low + self.gap) & (outline <= high - self.gap))
             clear = all(other.distance(outline).min() >= self.gap for other in placed)
@@ -238,17 +263,17 @@ class RampRanges:
 
 
 def _too_close(ramp: SimulatedRamp, corners: Extent, gap: float) -> bool:
-    """Whether a ramp comes closer to a rectangle than the gap."""
+    """Whether a ramp comes closer to a block than the gap."""
     low, high = corners
     beyond = np.maximum(np.maximum(low - ramp.outline(), ramp.outline() - high), 0.0)
     nearest = np.linalg.norm(beyond, axis=1).min()
-    # Corners of the rectangle may come nearer than any point of the outline, or lie within the bar.
-    points = np.stack(np.meshgrid(*np.stack([low, high], axis=-1), indexing="ij"), axis=-1).reshape(-1, 2)
+    # Corners of the block may come nearer than any point of the outline, or lie within the bar.
+    points = np.stack(np.meshgrid(*np.stack([low, high], axis=-1), indexing="ij"), axis=-1).reshape(-1, len(low))
     return bool(min(nearest, ramp.distance(points).min()) < gap)
 
 
 def distance_to_ramps(ramps: tuple[SimulatedRamp, ...], points: Array) -> Array:
-    """(K,) signed distance of points (K, 2) from the nearest bar, negative inside; infinite where there is none."""
+    """(K,) signed distance of points (K, D) from the nearest bar, negative inside; infinite where there is none."""
     nearest = np.full(len(points), np.inf)
     for ramp in ramps:
         nearest = np.minimum(nearest, ramp.distance(points))

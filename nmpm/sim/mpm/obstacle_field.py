@@ -5,7 +5,8 @@ along it; away from it material parts freely. The first free node is then on ave
 at the box's sides. Slanted faces cut cells at any angle, so that this alone would let particles seep in: those that end
 a substep too near are pushed out.
 
-The particles' distance is interpolated from a lattice four times as fine as the cells. A distance never changes faster
+The particles' distance is interpolated from a lattice four times as fine as the cells (twice in three dimensions, for
+its size). A distance never changes faster
 than its point moves, so that interpolation errs by less than half the diagonal of a lattice cell, and a particle is
 kept at that margin: it is never inside. It is pushed out along the gradient of the distance, to the side that it is on;
 a substep that carries it past the middle of an obstacle would let it out behind. So the thinnest obstacle bounds the
@@ -24,12 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nmpm._support.jit import jit
+from nmpm.sim.mpm import obstacles_3d
 from nmpm.sim.state import Array
 
 Distance = Callable[[Array], NDArray[Any]]
-"""From points (K, 2) to their signed distances (K,) from the obstacles, negative inside."""
+"""From points (K, D) to their signed distances (K,) from the obstacles, negative inside."""
 
-_LATTICE_PER_CELL = 4
+_LATTICE_PER_CELL = {2: 4, 3: 2}
 _PUSHES = 4
 
 
@@ -47,8 +49,8 @@ class ObstacleField:
     """Obstacles, sampled on a grid's nodes and on a finer lattice.
 
     Args:
-        nodes: (K, 2) indices of the nodes within a cell of an obstacle.
-        normals: (K, 2) unit vectors out of the obstacle at these nodes.
+        nodes: (K, D) indices of the nodes within a cell of an obstacle.
+        normals: (K, D) unit vectors out of the obstacle at these nodes.
         lattice: Of the particles' distances.
         friction: Coulomb friction of the obstacles.
     """
@@ -63,52 +65,57 @@ class ObstacleField:
         cls, distance: Distance, low: Array, size: float, shape: tuple[int, ...], friction: float
     ) -> ObstacleField:
         """Sample obstacles, given by their signed distance, on cells of a size and number from the box's corner on."""
-        spacing = size / _LATTICE_PER_CELL
-        at_lattice = _sample(distance, low, spacing, [np.arange(_LATTICE_PER_CELL * cells + 1) for cells in shape])
+        finer = _LATTICE_PER_CELL[len(shape)]
+        spacing = size / finer
+        at_lattice = _sample(distance, low, spacing, [np.arange(finer * cells + 1) for cells in shape])
         at_nodes = _sample(distance, low, size, [np.arange(cells + 2) - 0.5 for cells in shape])
         near = np.argwhere(at_nodes < size)
         normals = _normals(distance, low + size * (near - 0.5), spacing / 8)
-        lattice = Lattice(np.asarray(low, np.float64), spacing, at_lattice, lattice_margin(size))
+        lattice = Lattice(np.asarray(low, np.float64), spacing, at_lattice, lattice_margin(size, len(shape)))
         return cls(near, normals, lattice, friction)
 
     def depth(self, position: Array) -> Array:
-        """(N,) how much nearer to an obstacle than the margin particles (N, 2) are, in length; 0 where they are not."""
+        """(N,) how much nearer to an obstacle than the margin particles (N, D) are, in length; 0 where they are not."""
         depth = np.zeros(len(position))
-        _depths(position, self.lattice, depth)
+        (_depths if position.shape[1] == 2 else obstacles_3d.depths)(position, self.lattice, depth)
         return depth
 
     def brake(self, nodes: Array, fall: Array) -> None:
-        """Remove momentum into the obstacles from the nodes (X, Y, 3), in place.
+        """Remove momentum into the obstacles from the nodes (X, Y, 3) or (X, Y, Z, 4), in place.
 
-        `fall` (2,) is the change of velocity by gravity that follows: its part into the obstacles is removed as well.
+        `fall` (D,) is the change of velocity by gravity that follows: its part into the obstacles is removed as well.
         """
-        _brake(nodes, fall, self.nodes, self.normals, self.friction)
+        brake = _brake if len(fall) == 2 else obstacles_3d.brake
+        brake(nodes, fall, self.nodes, self.normals, self.friction)
 
     def push_out(self, before: Array, position: Array, velocity: Array, lower: Array, upper: Array) -> int:
         """Push particles that are too near out to the margin, and remove their velocity inwards; returns how many.
 
         Positions and velocities change in place. A particle that finds no room nearby, between `lower` and `upper`
-        (2,), goes back to its valid position `before`, and stops.
+        (D,), goes back to its valid position `before`, and stops.
         """
-        pushed: int = _push_out(before, position, velocity, lower, upper, self.lattice)
+        push_out = _push_out if len(lower) == 2 else obstacles_3d.push_out
+        pushed: int = push_out(before, position, velocity, lower, upper, self.lattice)
         return pushed
 
 
-def lattice_margin(size: float) -> float:
+def lattice_margin(size: float, dim: int) -> float:
     """Distance from obstacles at which particles are kept on a grid with cells of that size, in length."""
-    return size / _LATTICE_PER_CELL * math.sqrt(0.5)
+    return size / _LATTICE_PER_CELL[dim] * math.sqrt(dim / 4)
 
 
 def _sample(distance: Distance, low: Array, spacing: float, indices: list[NDArray[Any]]) -> Array:
     points = low + spacing * np.stack(np.meshgrid(*indices, indexing="ij"), axis=-1)
-    return np.ascontiguousarray(distance(points.reshape(-1, 2)).reshape(points.shape[:2]), dtype=np.float64)
+    at_points = distance(points.reshape(-1, len(indices))).reshape(points.shape[:-1])
+    return np.ascontiguousarray(at_points, dtype=np.float64)
 
 
 def _normals(distance: Distance, points: Array, step: float) -> Array:
     """Directions in which the distance grows, by central differences; upwards where it does not."""
-    slopes = np.stack([distance(points + step * axis) - distance(points - step * axis) for axis in np.eye(2)], axis=-1)
+    axes = np.eye(points.shape[1])
+    slopes = np.stack([distance(points + step * axis) - distance(points - step * axis) for axis in axes], axis=-1)
     length = np.linalg.norm(slopes, axis=-1, keepdims=True)
-    return np.where(length > 0, slopes / np.where(length > 0, length, 1.0), np.array([0.0, 1.0]))
+    return np.where(length > 0, slopes / np.where(length > 0, length, 1.0), axes[1])
 
 
 @jit

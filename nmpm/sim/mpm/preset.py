@@ -49,7 +49,7 @@ class MpmPreset(Preset):
         materials: What blocks are made of.
         blocks: How the initial state is drawn.
         walls: What the walls do with material that leaves them, a value of `Walls`.
-        ramps: Obstacles; in two dimensions only.
+        ramps: Obstacles; with a width in three dimensions.
 
     Raises:
         ConfigError: if the numbers contradict each other, or a substep is too long for elastic waves at rest.
@@ -91,11 +91,13 @@ class MpmPreset(Preset):
                 abs(cells - round(cells)) < 1e-6,
                 f"cells = {self.cells} along x make {cells:.3f} from {low} to {high}, not a whole number.",
             )
-        needs_2d = self.ramps is not None or self.gravity_turn or self.walls == Walls.OPEN_CORNERS.value
+        needs_2d = self.gravity_turn or self.walls == Walls.OPEN_CORNERS.value
         check(
             self.dim == 2 or not needs_2d,
-            "ramps, gravity_turn and open corners are implemented in two dimensions, not in three.",
+            "gravity_turn and open corners are implemented in two dimensions, not in three.",
         )
+        if self.ramps is not None and (self.ramps.width is None) != (self.dim == 2):
+            raise ConfigError(f"ramps.width = {self.ramps.width}: ramps have a width in three dimensions, not in two.")
         for material in self.materials:
             material.rest(self.dim)
 
@@ -224,7 +226,10 @@ class MpmPreset(Preset):
         return self.blocks.particles[1] + static
 
     def to_dict(self) -> dict[str, Any]:
-        return super().to_dict() | {"materials": {material.name: to_plain(material) for material in self.materials}}
+        plain = super().to_dict() | {"materials": {material.name: to_plain(material) for material in self.materials}}
+        if self.ramps is not None and self.ramps.width is None:
+            del plain["ramps"]["width"]
+        return plain
 
     @classmethod
     def from_dict(cls, plain: Mapping[str, Any]) -> Self:

@@ -57,5 +57,8 @@ def longest_particle_substep(material: Material, cell_size: float, dim: int, spe
 
 
 def longest_travel_substep(cell_size: float, speed: float, thickness: float) -> float:
-    """Longest substep for particles that meet each other or an obstacle of some thickness, in seconds."""
-    return min(cell_size / 2, thickness / 2 + lattice_margin(cell_size)) / max(speed, 1e-300)
+    """Longest substep for particles that meet each other or an obstacle of some thickness, in seconds.
+
+    In three dimensions, particles are kept at a larger margin than this allows for.
+    """
+    return min(cell_size / 2, thickness / 2 + lattice_margin(cell_size, 2)) / max(speed, 1e-300)

@@ -108,13 +108,13 @@ class MpmStepper:
         dt: Length of a substep, in seconds.
 
     Raises:
-        ConfigError: if the grid has three dimensions, and obstacles or open corners.
+        ConfigError: if the grid has three dimensions, and open corners.
     """
 
     def __init__(self, grid: MpmGrid, dt: float) -> None:
         dim, in_corners = len(grid.shape), grid.walls is Walls.OPEN_CORNERS
-        if dim == 3 and (grid.obstacles is not None or in_corners):
-            raise ConfigError("Obstacles and open corners are implemented in two dimensions, not in three.")
+        if dim == 3 and in_corners:
+            raise ConfigError("Open corners are implemented in two dimensions, not in three.")
         self.grid = grid
         self.dt = dt
         self.held_back = 0

@@ -58,6 +58,23 @@ def test_drawn_bars_keep_their_distance_from_everything(seed, low):
     assert sum(len(ramp.particles(0.01)) for ramp in drawn) <= RAMPS.max_particles(0.01)
 
 
+def test_slabs_keep_their_distance_in_three_dimensions():
+    ranges = dataclasses.replace(RAMPS, width=(0.1, 0.4))
+    block = np.array([0.4, 0.4, 0.4]), np.array([0.6, 0.6, 0.6])
+    inside = np.stack(np.meshgrid(*np.linspace(*block, 12).T, indexing="ij"), -1).reshape(-1, 3)
+    for seed in range(5):
+        drawn = ranges.draw((*BOX, (0.1, 0.9)), [block], np.random.default_rng(seed))
+        for ramp in drawn:
+            points = ramp.particles(0.01)
+            assert len(points) == round(ramp.length / 0.01) * 3 * round(ramp.width / 0.01)
+            assert ramp.distance(points).max() < 0
+            assert np.all((points >= 0.15) & (points <= 0.85))
+            assert ramp.distance(inside).min() >= 0.04
+            assert all(other is ramp or other.distance(points).min() >= 0.04 for other in drawn)
+        assert len({round(ramp.turn, 6) for ramp in drawn}) == len(drawn)
+        assert sum(len(ramp.particles(0.01)) for ramp in drawn) <= ranges.max_particles(0.01)
+
+
 @pytest.mark.slow
 def test_a_box_too_crowded_is_an_error():
     crowded = dataclasses.replace(GOOP, blocks=dataclasses.replace(GOOP.blocks, particles=(20_000, 21_000)))

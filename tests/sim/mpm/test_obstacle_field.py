@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.errors import DataError
+from nmpm.sim.mpm.layouts import SimulatedRamp
 from nmpm.sim.mpm.obstacle_field import ObstacleField
 from nmpm.sim.mpm.solids import Goop, Sand
 from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, MpmStepper
@@ -78,6 +79,60 @@ def test_a_particle_too_near_is_pushed_out_without_its_velocity_inwards():
     assert field.push_out(before, position, velocity, np.zeros(2), np.ones(2)) == 1
     np.testing.assert_allclose(position, [[0.3, 0.35 + field.lattice.margin], *before[1:].tolist()], atol=1e-3 * SIZE)
     np.testing.assert_allclose(velocity, [[1.0, 0.0], [1.0, -2.0], [1.0, -2.0]], atol=1e-12)
+
+
+def ramp(centre, angle, turn):
+    return SimulatedRamp(centre, 0.4, 0.05, angle, width=0.4, turn=turn)
+
+
+def stepper_3d(distance, friction, cells=32):
+    field = ObstacleField.sample(distance, np.zeros(3), SIZE, (cells,) * 3, friction)
+    grid = MpmGrid(np.zeros(3), SIZE, (cells,) * 3, friction, np.array([0.0, -9.81, 0.0]), obstacles=field)
+    return MpmStepper(grid, DT)
+
+
+def cube(sides, low):
+    points = np.stack(np.meshgrid(*map(range, sides), indexing="ij"), -1).reshape(-1, 3)
+    return np.array(low) + SIZE / 2 * (points + 0.5)
+
+
+@pytest.mark.parametrize(("angle", "turn"), [(0.4, 0.0), (-0.7, 2.0), (0.0, 1.0)])
+def test_water_in_three_dimensions_never_enters_a_slab(angle, turn):
+    slab = ramp((0.2, 0.12, 0.2), angle, turn)
+    run = stepper_3d(slab.distance, 0.0)
+    position = cube((12, 8, 12), (0.17, 0.28, 0.17))
+    moving = MpmParticles(position, np.tile([0.0, -4.0, 0.0], (len(position), 1)), ((WATER, len(position)),), 2e-7)
+    run.enclose(moving)
+    for _ in range(250):
+        run.step(moving)
+        assert slab.distance(moving.position).min() >= 0
+    assert slab.distance(moving.position).min() < 2 * SIZE
+    assert run.held_back == 0
+
+
+def test_a_particle_too_near_a_slab_is_pushed_out_without_its_velocity_inwards():
+    slab = ramp((0.2, 0.15, 0.2), 0.4, 0.8)
+    field, (_, out, wide) = stepper_3d(slab.distance, 0.0).grid.obstacles, slab._axes
+    before = np.array(slab.centre) + np.outer([0.06, 0.0353, 0.1], out)
+    position, velocity = before - np.outer([0.03, 0.0, 0.0], out), np.tile(wide - 2.0 * out, (3, 1))
+    assert field.push_out(before, position, velocity, np.zeros(3), np.ones(3)) == 1
+    np.testing.assert_allclose(slab.distance(position), [field.lattice.margin, 0.0103, 0.075], atol=0.01 * SIZE)
+    np.testing.assert_allclose(velocity, [wide, wide - 2.0 * out, wide - 2.0 * out], atol=1e-9)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.2, 5.0])
+def test_nodes_at_a_slab_keep_the_velocity_along_it_less_friction(friction):
+    slab = ramp((0.2, 0.15, 0.2), 0.4, 0.8)
+    field, (along, out, wide) = stepper_3d(slab.distance, friction).grid.obstacles, slab._axes
+    above = np.argwhere(np.abs(field.normals - out).max(1) < 1e-6)[:, 0]
+    assert len(above) > 50
+    nodes = np.zeros((34, 34, 34, 4))
+    nodes[..., 0], fall = 2.0, np.array([0.1, -0.5, 0.0])
+    nodes[..., 1:] = 2.0 * (3.0 * along + 4.0 * wide - 2.0 * out - fall)
+    field.brake(nodes, fall)
+    after = nodes[tuple(field.nodes[above].T)][:, 1:] / 2.0 + fall
+    expected = (3.0 * along + 4.0 * wide) * max(0.0, 1 - friction * 2.0 / 5.0)
+    np.testing.assert_allclose(after, np.tile(expected, (len(above), 1)), atol=1e-9)
 
 
 @pytest.mark.parametrize(("friction", "tolerance"), [(0.0, 0.03), (0.2, 0.06), (0.9, 0.03)])
