@@ -141,14 +141,15 @@ class Pretrained:
             data = nmpm.load_trajectories("grains")
             model.rollout(model.start(data.test[0]), frames=100)
 
-        Velocities are those from the frame before, obstacles are taken apart, and particles that are absent in one of
-        these two frames are left out. Sizes of particles are relative to the mean of those that are there.
+        Velocities are those from the frame before, or in a model of other frames the best estimate of that between
+        two of these; obstacles are taken apart, and particles that are absent in between are left out. Sizes of
+        particles are relative to the mean of those that are there.
 
         Args:
             trajectory: From `nmpm.load_trajectories`, which knows the names of its types; one made of arrays suffices
                 for a model of one material.
             frame: 1 or later.
-            materials: The model's material by name of the trajectory's, where they differ.
+            materials: The model's material by name of the trajectory's, where they differ; those of `match` are known.
 
         Raises:
             DataError: if the trajectory's materials are not the model's, no particle is there, or as for `state`.

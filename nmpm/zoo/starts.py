@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,7 @@ import torch
 from nmpm._support.messages import suggestion
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.gravity import trajectory_gravity
+from nmpm.data.loading.model_frames import model_velocity
 from nmpm.data.statistics import displacements
 from nmpm.data.volumes import relative_volumes
 from nmpm.errors import ConfigError, DataError
@@ -33,26 +35,47 @@ def state_of(
         raise ConfigError(f"frame = {frame} must be 1 … {frames - 1}: velocities need the frame before it.")
     if metadata.dim != model.scene.dim:
         raise DataError(f"The trajectory has {metadata.dim} axes, the model {model.scene.dim}.")
-    pair = trajectory.position[frame - 1 : frame + 1]
-    present = ~np.isnan(pair[..., 0]).any(axis=0)
+    back = min(frame, max(1, round(model.scene.dt / metadata.dt)))
+    steps = _steps(trajectory, metadata, frame, back)
+    present, position = ~np.isnan(steps[1, :, 0]), trajectory.position[frame]
     types = trajectory.particle_type
     moving, obstacle = metadata.is_moving(types) & present, np.isin(types, list(metadata.obstacle_types)) & present
     if not moving.any():
-        raise DataError(f"No particle that moves is there in frames {frame - 1} and {frame} of the trajectory.")
-    velocity = displacements(pair, metadata)[0] / metadata.dt
+        raise DataError(f"No particle that moves is there in frames {frame - back} and {frame} of the trajectory.")
+    renamed = {} if model.match is None else model.match.reading.materials
     state = model.state(
-        pair[1, moving],
-        velocity=velocity[moving],
-        material=_materials(model, metadata, types[moving], materials or {}),
-        obstacle=pair[1, obstacle] if obstacle.any() else None,
+        position[moving],
+        velocity=_velocity(model, trajectory, metadata, steps[:, moving], back),
+        material=_materials(model, metadata, types[moving], {**renamed, **(materials or {})}),
+        obstacle=position[obstacle] if obstacle.any() else None,
         gravity=_gravity(model, trajectory, metadata),
         fields=_fields(model, trajectory, frame, moving),
         volume=relative_volumes(trajectory, moving),
     )
     if not model.scene.moving_obstacles or not obstacle.any():
         return state
-    moved = torch.from_numpy(velocity[obstacle]).to(state.obstacle) * model.scene.dt
+    moved = torch.from_numpy(steps[1, obstacle] / (back * metadata.dt)).to(state.obstacle) * model.scene.dt
     return dataclasses.replace(state, obstacle_velocity=moved[None])
+
+
+def _steps(trajectory: Trajectory, metadata: Metadata, frame: int, back: int) -> np.ndarray:
+    """(2, N, D) the last two steps of `back` frames until a frame, the earlier one NaN where that is not recorded."""
+    last, first = displacements(trajectory.position[frame - back : frame + 1], metadata).sum(axis=0), frame - 2 * back
+    if first < 0:
+        return np.stack([np.full_like(last, np.nan), last])
+    return np.stack([displacements(trajectory.position[first : frame - back + 1], metadata).sum(axis=0), last])
+
+
+def _velocity(
+    model: Pretrained, trajectory: Trajectory, metadata: Metadata, steps: np.ndarray, back: int
+) -> np.ndarray:
+    """(N, D) velocity in length per second, that between the last two frames of the model, of (2, N, D) `_steps`."""
+    ratio = model.scene.dt / (back * metadata.dt)
+    ratio = 1.0 if math.isclose(ratio, 1.0, rel_tol=1e-3) else ratio
+    pull = trajectory_gravity(trajectory.attributes, metadata, "the trajectory") or (0.0,) * metadata.dim
+    before, last = map(torch.from_numpy, steps)
+    gravity = last.new_tensor(pull).view(1, -1) * (back * metadata.dt) ** 2
+    return model_velocity(last, last - before, gravity, ratio).numpy() / (ratio * back * metadata.dt)
 
 
 def _metadata(model: Pretrained, trajectory: Trajectory) -> Metadata:

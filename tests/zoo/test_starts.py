@@ -9,7 +9,9 @@ from scenes import box
 
 from nmpm.data.format import Trajectory
 from nmpm.data.metadata import scene_metadata
+from nmpm.emulator.similarity import Match
 from nmpm.errors import ConfigError, DataError
+from nmpm.scene import Reading
 from tests.zoo.test_states import model_of
 
 SCENE = box(materials=("water", "sand"), obstacles=True)
@@ -74,3 +76,29 @@ def test_frames_and_gravity_that_do_not_fit_are_refused(model):
             model.start(recorded(), frame)
     with pytest.raises(DataError, match="the model knows only"):
         model.start(recorded(gravity=(0.0, 9.81)))
+
+
+@pytest.mark.parametrize("ratio", [1 / 4, 1 / 2, 2, 3])
+@pytest.mark.parametrize("frame", [1, 2, 7])
+def test_a_free_fall_starts_exactly_in_a_model_of_other_frames(ratio, frame):
+    scene = dataclasses.replace(SCENE, dt=SCENE.dt * ratio)
+    finer = 4 * np.arange(9)[:, None, None]  # frames of a clock of which one of the data has four
+    gravity = np.array([0.0, -9.81]) * (SCENE.dt / 4) ** 2
+    thrown = np.random.default_rng(0).normal(scale=2e-4, size=(1, 6, 2))
+
+    def fallen(n):
+        return 0.5 + 0.01 * np.arange(6)[:, None] + thrown * n + gravity * n * (n + 1) / 2
+
+    metadata = scene_metadata(SCENE, TYPES, 2)
+    trajectory = Trajectory(fallen(finer), np.array([0, 0, 1, 1, 0, 0]), metadata=metadata)
+    state = model_of(scene).start(trajectory, frame)
+    exact = fallen(4 * frame) - fallen(4 * frame - 4 * ratio)
+    np.testing.assert_allclose(state.velocity[0], exact[0], rtol=0, atol=1e-6)
+
+
+def test_a_match_knows_the_names_of_the_materials(model):
+    trajectory = recorded(particle_types={0: "grit", 1: "brine", 2: "wall"})
+    reading = Reading(SCENE, {"grit": "sand", "brine": "water"})
+    matched = dataclasses.replace(model, match=Match(model.emulator.recipe, reading, (), ()))
+    assert matched.start(trajectory).material.tolist() == [[1, 1, 0, 0]]
+    assert matched.start(trajectory, materials={"grit": "water"}).material.tolist() == [[0, 0, 0, 0]]
