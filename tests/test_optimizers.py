@@ -1,10 +1,13 @@
 """SOAP, which the shipped configurations train with."""
 
+import copy
 from functools import partial
 
 import pytest
 import torch
 
+from nmpm import optimizers
+from nmpm.emulator.runtimes import cuda_graph
 from nmpm.errors import ConfigError
 from nmpm.optimizers import SOAP
 
@@ -33,3 +36,56 @@ def test_it_finds_the_axes_along_which_a_problem_is_stretched():
 def test_complex_weights_are_refused_with_what_takes_them():
     with pytest.raises(ConfigError, match=r"complex.*torch\.optim\.Adam"):
         SOAP([torch.nn.Parameter(torch.zeros(2, 2, dtype=torch.complex64))])
+
+
+@pytest.mark.parametrize("frequency", [1, 4])
+def test_recorded_steps_move_weights_as_others_do(monkeypatch, device, frequency):
+    def train(resume_at: int) -> list[torch.Tensor]:
+        generator = torch.Generator().manual_seed(0)
+        shapes = ((4, 3, 3, 3), (4,), (5, 7))
+        weights = [torch.nn.Parameter(torch.randn(shape, generator=generator).to(device)) for shape in shapes]
+        optimizer = SOAP(weights, lr=0.01, precondition_frequency=frequency)
+        for step in range(14):
+            if step == resume_at:
+                state = copy.deepcopy(optimizer.state_dict())
+                optimizer = SOAP(weights, lr=0.5, precondition_frequency=frequency)
+                optimizer.load_state_dict(state)
+            for weight in weights:
+                weight.grad = torch.randn(weight.shape, generator=generator).to(device)
+            optimizer.param_groups[0]["lr"] = 0.01 * (1 - step / 14)
+            optimizer.step()
+        return [weight.detach() for weight in weights]
+
+    replays = []
+
+    def record(function, *arguments):
+        for _ in range(3 if device.type == "cpu" else 0):
+            function()
+        replay, result = (function, None) if device.type == "cpu" else on_gpu(function, *arguments)
+        return (lambda: (replays.append(1), replay())), result
+
+    on_gpu = cuda_graph.record
+    monkeypatch.setattr(optimizers, "is_on_gpu", lambda _: False)
+    plain = train(resume_at=20)
+    monkeypatch.setattr(optimizers, "is_on_gpu", lambda _: True)
+    monkeypatch.setattr(cuda_graph, "record", record)
+    for resume_at in (20, 7):
+        for one, other in zip(train(resume_at), plain, strict=True):
+            exact = {"rtol": 0, "atol": 0} if device.type == "cpu" else {"rtol": 1e-4, "atol": 1e-5}
+            torch.testing.assert_close(one, other, **exact)
+    assert len(replays) == (0 if frequency == 1 else 26)
+
+
+def test_steps_that_cannot_be_recorded_are_computed_with_one_warning(monkeypatch):
+    weight = torch.nn.Parameter(torch.ones(3, 3))
+    optimizer = SOAP([weight])
+    monkeypatch.setattr(optimizers, "is_on_gpu", lambda _: True)
+    monkeypatch.setattr(cuda_graph, "record", lambda *_: 1 / 0)
+    weight.grad = torch.eye(3)
+    optimizer.step()
+    with pytest.warns(UserWarning, match="Steps of SOAP are not recorded as CUDA graphs: division by zero"):
+        optimizer.step()
+    moved = weight[0, 0].item()
+    optimizer.step()
+    assert weight[0, 0].item() < moved < 1
+    copy.deepcopy(optimizer).step()  # without gradients

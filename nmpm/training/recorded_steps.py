@@ -29,7 +29,7 @@ from nmpm.particles import Particles, Window
 Error = Callable[[Emulator, Particles, Window], Tensor]
 """The mean error () of an emulator's predictions, from the particles that windows start with, with gradients."""
 
-MULTIPLE = 128
+MULTIPLE = 512
 """Numbers of particles are multiples of it in recorded steps, so that few graphs serve all batches."""
 _MOST = 16
 """Graphs that are kept: each holds memory. Steps of further shapes are computed operation by operation."""
