@@ -9,15 +9,14 @@ from typing import Any
 import torch
 from lightning.pytorch import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
-from lightning.pytorch.utilities import rank_zero_info
 
 from nmpm.data.convert import Options
-from nmpm.data.format import find_split, split_paths, split_renames
+from nmpm.data.format import split_paths
 from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.padded_batch import pin_for
 from nmpm.data.loading.recording import SplitRecordings
-from nmpm.data.loading.sources import HoldOut, SourceName, make_source
+from nmpm.data.loading.sources import SourceName, hold_out, make_source
 from nmpm.data.loading.window_plan import PlanStart, WindowPlan
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
@@ -173,22 +172,12 @@ class TrajectoryDataModule(LightningDataModule):
             self._history = None
         present = split_paths(self.data_source.folder)
         if "valid" not in present and self.trainer is not None and self.trainer.enable_validation:
-            self._hold_out()
+            self.data_source = hold_out(self.data_source)
         for name in present:
             recordings = self.recordings(name)
             recordings.check_ends()
             if name != "train":
                 recordings.with_frames(3, "an evaluation")
-
-    def _hold_out(self) -> None:
-        """Validate on a part of the training trajectories."""
-        if isinstance(self.data_source, HoldOut):
-            return
-        if split_renames(self.data_source.folder, ("valid",)):
-            find_split(self.data_source.folder, "valid")  # raises, and says how to rename it
-        self.data_source = HoldOut(self.data_source)
-        held = self.recordings("valid")
-        rank_zero_info(f"No valid.h5: {held.split.where(held.indices[0])} validates and is not trained on.")
 
     @property
     def has_test(self) -> bool:

@@ -68,7 +68,7 @@ def read_fields(split: Split, index: int, names: Iterable[str]) -> dict[str, np.
             values = group.get(name)
             if values is not None and hasattr(values, "dtype"):
                 check_stored_size(values, f"{where}: {name}")
-                fields[name] = _arrange(values[()], sizes, f"{where}: {name}")
+                fields[name] = _arrange(split.cut(index, values[()]), sizes, f"{where}: {name}")
             elif name in group.attrs:
                 fields[name] = _arrange(group.attrs[name], sizes, f"{where}: {name}")
     return fields

@@ -129,12 +129,16 @@ class _Entry:
 class Split:
     """The trajectories of an HDF5 file, read on access. Keeps no file open, so that it can be pickled and shared.
 
+    Args:
+        path: The file.
+        span: The frames of each trajectory that count, as if there were no others; all of them when left out.
+
     Raises:
         DataError: if the file is missing, damaged, not of the layout above, or takes content from other files.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = Path(path)
+    def __init__(self, path: Path, span: slice = slice(None)) -> None:
+        self.path, self.span = Path(path), span
         if not self.path.exists():
             raise DataError(f"{self.path}: no such file{_other_files(self.path.parent)}.")
         if not self._entries:
@@ -155,7 +159,11 @@ class Split:
 
     def frames(self, index: int) -> int:
         """Number of frames, T, of a trajectory."""
-        return self._entries[index].frames
+        return len(self._frames(index))
+
+    def _frames(self, index: int) -> range:
+        """The frames of the file that count."""
+        return range(self._entries[index].frames)[self.span]
 
     def particles(self, index: int) -> int:
         """Number of particles, N, of a trajectory, static ones included."""
@@ -168,7 +176,9 @@ class Split:
 
     def where(self, index: int) -> str:
         """File and trajectory, for error messages."""
-        return f"{self.path}, trajectory {self._entries[index].name}"
+        frames = self._frames(index)
+        part = f", frames {frames.start} to {frames.stop - 1}" if len(frames) < self._entries[index].frames else ""
+        return f"{self.path}, trajectory {self._entries[index].name}{part}"
 
     def particle_type(self, index: int) -> np.ndarray:
         """The (N,) int64 type ids of a trajectory."""
@@ -177,21 +187,21 @@ class Split:
 
     def time(self, index: int) -> np.ndarray | None:
         """The (T,) float64 times of a trajectory's frames, its field `time`; None where it has none."""
-        time = self._numbers(index, "time", (self.frames(index),), "iuf")
+        time = self._numbers(index, "time", (self._entries[index].frames,), "iuf")
         return None if time is None else time.astype(np.float64)
 
     def tracks(self, index: int) -> np.ndarray | None:
         """The (T, N) numbers of the particles in each column, its field `track`; None where each holds one alone."""
-        return self._numbers(index, TRACK, (self.frames(index), self.particles(index)), "iu")
+        return self._numbers(index, TRACK, (self._entries[index].frames, self.particles(index)), "iu")
 
     def _numbers(self, index: int, name: str, shape: tuple[int, ...], kinds: str) -> np.ndarray | None:
-        """A field of a trajectory, or None if it has none of that name, shape and kinds of numbers."""
+        """The frames of a field, or None if the trajectory has none of that name, shape and kinds of numbers."""
         with open_hdf5(self.path) as file:
             stored = file[self._entries[index].name].get(name)
             if not isinstance(stored, h5py.Dataset) or stored.shape != shape or stored.dtype.kind not in kinds:
                 return None
             check_stored_size(stored, f"{self.where(index)}: {name}")
-            return np.asarray(stored[()])
+            return np.asarray(stored[self.span])
 
     def attributes(self, index: int) -> dict[str, Any]:
         """The attributes of a trajectory."""
@@ -207,8 +217,13 @@ class Split:
                 if name not in CORE and isinstance(group[name], h5py.Dataset):
                     check_field(name, group[name], self.where(index))
                     check_stored_size(group[name], f"{self.where(index)}: {name}")
-                    fields[name] = np.asarray(group[name][()])
+                    fields[name] = self.cut(index, np.asarray(group[name][()]))
         return fields
+
+    def cut(self, index: int, values: np.ndarray) -> np.ndarray:
+        """The frames that count of a field's values; those that have none as they are."""
+        entry = self._entries[index]
+        return values[self.span] if values.shape[:2] == (entry.frames, entry.particles) else values
 
     def read_with_fields(self, index: int) -> Trajectory:
         """Reads a trajectory with its fields."""
@@ -221,12 +236,13 @@ class Split:
             DataError: if they cannot be read, or a position is infinite or NaN in some coordinates only.
         """
         name = self._entries[index].name  # an IndexError ends iterations, within `open_hdf5` it would be a DataError
+        frames = self._frames(index)[start:stop]
         with open_hdf5(self.path) as file:
             group = file[name]
-            position = np.asarray(group["position"][start:stop], dtype=np.float32)
+            position = np.asarray(group["position"][frames.start : frames.stop], dtype=np.float32)
             particle_type = np.asarray(group["particle_type"][()], dtype=np.int64)
             attributes = dict(group.attrs)
-        check_positions(position, self.where(index), first_frame=start)
+        check_positions(position, self.where(index), first_frame=frames.start)
         return Trajectory(position, particle_type, attributes)
 
     @cached_property

@@ -37,12 +37,12 @@ def mean_volume(split: Split, metadata: Metadata) -> float | None:
 
 def volumes(split: Split, index: int, metadata: Metadata) -> np.ndarray | None:
     """(N,) volumes of a trajectory's particles, as in `mean_volume`; None where no field gives them."""
-    frames, particles = split.frames(index), split.particles(index)
+    particles = split.particles(index)
     with open_hdf5(split.path) as file:
         group = file[split.names[index]]
         for name in SIZES:
             stored = group.get(name)
-            if isinstance(stored, h5py.Dataset) and stored.shape in ((particles,), (frames, particles)):
+            if isinstance(stored, h5py.Dataset) and stored.ndim <= 2 and stored.shape[-1:] == (particles,):
                 check_stored_size(stored, f"{split.where(index)}: {name}")
                 return _volumes_of(name, stored, metadata.dim)
     return None

@@ -9,14 +9,16 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from lightning.pytorch.utilities import rank_zero_info
+
 from nmpm.data.convert import Options, native_folder
-from nmpm.data.format import Metadata, Split, find_split, is_native, read_metadata
+from nmpm.data.format import Metadata, Split, find_split, is_native, read_metadata, split_renames
 from nmpm.data.hub import hub_folder
 from nmpm.data.loading.buffer import RecordingProvider
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.window_plan import WindowPlan
 from nmpm.data.scene_inference import infer_scene
-from nmpm.errors import ConfigError, DataError
+from nmpm.errors import ConfigError
 from nmpm.scene import Reading, Scene
 
 SourceName = Literal["disk", "simulate", "hub"]
@@ -108,25 +110,13 @@ class FolderSource(DataSource):
 
 @dataclass(frozen=True)
 class HoldOut(DataSource):
-    """A source without a valid split, of whose training trajectories the last validates.
+    """A source without a valid split: the last of its training trajectories validates, or of a single one the end.
 
     Args:
-        source: With two training trajectories or more.
-
-    Raises:
-        DataError: if it has only one.
+        source: Has a train split.
     """
 
     source: DataSource
-
-    def __post_init__(self) -> None:
-        training = self.source.recordings("train")
-        if len(training) < 2:
-            raise DataError(
-                f"{training.split.path}: there is no valid.h5 beside it, by which the best weights are chosen, and one"
-                " trajectory alone: put another into valid.h5, or train without validations, which keeps the last"
-                " weights: --trainer.limit_val_batches 0."
-            )
 
     @property
     def description(self) -> str:
@@ -147,8 +137,27 @@ class HoldOut(DataSource):
     def recordings(self, name: str, reading: Reading | None = None) -> SplitRecordings:
         if name not in ("train", "valid"):
             return self.source.recordings(name, reading)
-        every = self.source.recordings("train", reading)
-        return every.subset(every.indices[:-1] if name == "train" else every.indices[-1:])
+        every, validates = self.source.recordings("train", reading), name == "valid"
+        if len(every) > 1:
+            return every.subset(every.indices[-1:] if validates else every.indices[:-1])
+        end = every.split.frames(0) * 4 // 5
+        span = slice(end, None) if validates else slice(end)
+        return SplitRecordings(Split(every.split.path, span), self.metadata, self.scene, reading=reading)
+
+
+def hold_out(source: DataSource) -> DataSource:
+    """A source without a valid split as `HoldOut`, which it says.
+
+    Raises:
+        DataError: if its folder has that split under another name.
+    """
+    if isinstance(source, HoldOut):
+        return source
+    if split_renames(source.folder, ("valid",)):
+        find_split(source.folder, "valid")  # raises, and says how to rename it
+    held = HoldOut(source).recordings("valid")
+    rank_zero_info(f"No valid.h5: {held.split.where(held.indices[0])}, validates and is not trained on.")
+    return HoldOut(source)
 
 
 @dataclass(frozen=True)
