@@ -14,6 +14,8 @@ from nmpm.errors import DataError
 
 SIZES = ("volume", "radius", "diameter", "size")
 """Names of fields that say how large particles are; the first that a trajectory has counts."""
+VOLUME = "particle_volume"
+"""Attribute of a trajectory whose particles have a volume of their own, other than the dataset's."""
 _VARIES = 1.01  # largest over smallest volume; below that, all particles are alike
 _CONSTANT = 1e-5  # of a value; it may change by that in time
 _SAMPLE = 8  # trajectories
@@ -56,7 +58,7 @@ def stated_volumes(trajectory: Trajectory, particle_volume: float | None, where:
     Raises:
         DataError: naming `where`, if the attribute is not a positive number.
     """
-    stated = trajectory.attributes.get("particle_volume")
+    stated = trajectory.attributes.get(VOLUME)
     if stated is None or particle_volume is None:
         return None
     values = np.asarray(stated)

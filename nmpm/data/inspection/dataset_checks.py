@@ -17,6 +17,7 @@ from nmpm.data.inspection.motion import Motion, spacing_of
 from nmpm.data.inspection.stated import check_stated, find_odd_particles, free_fall
 from nmpm.data.statistics import Extent
 from nmpm.data.times import recorded_step
+from nmpm.data.volumes import VOLUME
 from nmpm.errors import DataError
 
 WINDOW = 18
@@ -69,7 +70,8 @@ class DatasetChecks:
             self._steps_of_fall[motion.where] = dt
         if len(motion.index) >= _LEAST_PARTICLES and motion.spacing:
             later = spacing_of(motion.position[len(motion.position) // 2], self.metadata)
-            self._spacings[motion.where] = motion.spacing, later or motion.spacing
+            if VOLUME not in motion.trajectory.attributes:
+                self._spacings[motion.where] = motion.spacing, later or motion.spacing
             self._extents[motion.where], self._stays[motion.where] = motion.extent, motion.stays
         self.spacing = min(self.spacing, motion.spacing or math.inf)
         self._rounding = max(self._rounding, motion.rounding)

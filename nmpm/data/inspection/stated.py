@@ -15,6 +15,7 @@ from nmpm.data.inspection.findings import Finding, Severity
 from nmpm.data.inspection.motion import Motion, spacing_of
 from nmpm.data.statistics import first_moving_particle, first_outside
 from nmpm.data.times import recorded_step, uneven_step
+from nmpm.data.volumes import VOLUME
 
 _FIRST_STEPS = 32  # in which particles are looked for that fly freely
 _LEAST_PARTICLES = 8
@@ -158,8 +159,8 @@ def _is_earth(gravity: Sequence[float] | np.ndarray) -> bool:
 
 def check_volume(motion: Motion) -> Iterator[Finding]:
     """Yields a finding if the stated particle volume is far from that of the densest of some frames."""
-    stated, dim = motion.metadata.particle_volume, motion.metadata.dim
-    measured = "particle_volume" in motion.metadata.extra.get(FOUND, {})  # in these trajectories
+    stated, dim = motion.trajectory.attributes.get(VOLUME, motion.metadata.particle_volume), motion.metadata.dim
+    measured = VOLUME in motion.metadata.extra.get(FOUND, {})  # in these trajectories
     if stated is None or measured or len(motion.index) < _LEAST_PARTICLES:
         return
     frames = np.unique(np.linspace(0, len(motion.position) - 1, _VOLUME_FRAMES).astype(int))

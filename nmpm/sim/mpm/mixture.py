@@ -229,7 +229,7 @@ class MpmMixture(Preset):
         if rng.random() >= varied.share:
             return self._variant(part, 1.0, fit_box(part, part.spacing, self._sides(part))), 1.0
         moved = varied.inset * rng.random((2, 2)) * (rng.random((2, 2)) < varied.narrowed)
-        sides = [(low + a, high - b) for (low, high), (a, b) in zip(self._sides(part), moved.tolist(), strict=True)]
+        sides = [(low + a, high - b) for (low, high), (a, b) in zip(self.box, moved.tolist(), strict=True)]
         time, spacing = (math.exp(rng.uniform(*np.log(each))) for each in (varied.time, varied.spacing))
         box = fit_box(part, spacing, sides)
         changes: dict[str, Any] = {
@@ -241,7 +241,7 @@ class MpmMixture(Preset):
         return self._variant(part, time, box, **changes), time
 
     def _sides(self, part: MpmPreset) -> list[Interval]:
-        """How far a part's particles get along each axis: its own wall layer within the domain, but within `box`."""
+        """How far particles of a part that is not varied get: up to its own wall layer in the domain, within `box`."""
         layer = part.reach[0][0] - part.domain[0][0]
         pairs = zip(self.domain, self.box, strict=True)
         return [(max(outer[0] + layer, low), min(outer[1] - layer, high)) for outer, (low, high) in pairs]

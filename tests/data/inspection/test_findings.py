@@ -38,6 +38,7 @@ class Data:
     types: np.ndarray
     runs: dict[str, list[np.ndarray]]
     fields: dict[str, np.ndarray] = field(default_factory=dict)  # of all runs
+    attributes: dict[str, Any] = field(default_factory=dict)  # likewise
 
     def change(self, change: Callable[[np.ndarray], np.ndarray], runs: slice = slice(None)) -> None:
         """Changes positions of runs of the train split."""
@@ -63,7 +64,8 @@ class Data:
         """What an inspection finds, one of each kind."""
         for name, runs in self.runs.items():
             write_split(
-                folder / f"{name}.h5", (Trajectory(np.float32(run), self.types, {}, self.fields) for run in runs)
+                folder / f"{name}.h5",
+                (Trajectory(np.float32(run), self.types, self.attributes, self.fields) for run in runs),
             )
         write_metadata(folder, self.metadata)
         return merge_findings(inspect(FolderSource(folder)).findings, sum(map(len, self.runs.values())))
@@ -98,6 +100,12 @@ def data() -> Data:
 
 
 def test_nothing_is_found_in_data_without_lies(data, tmp_path):
+    assert data.findings(tmp_path) == ()
+
+
+def test_trajectories_that_state_their_volume_may_differ_in_it(data, tmp_path):
+    data.change(lambda run: thrown_block(9, spacing=0.03), ONE)
+    data.attributes = {"particle_volume": 0.0006}
     assert data.findings(tmp_path) == ()
 
 

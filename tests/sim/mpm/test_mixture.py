@@ -47,7 +47,7 @@ def test_variation_reaches_all_that_it_names():
     assert 0.4 < np.mean(fall[:, 0] == 0) < 0.8
     assert {0, 1} < {len(start.obstacles) for start in drawn}
     assert all(start.variant.substeps >= start.variant.stable_substeps for start in drawn)
-    assert max(len(start.position) for start in drawn) <= 4000
+    assert max(len(start.position) for start in drawn) <= 3000
 
 
 @pytest.mark.parametrize("start", STARTS, ids=range(len(STARTS)))
