@@ -91,8 +91,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _load(arguments: argparse.Namespace) -> ModelUnderTest:
     from nmpm.evaluation.stress import ModelUnderTest
-    from nmpm.sim import load_preset, preset_names
+    from nmpm.sim import load_preset
     from nmpm.zoo import load_model
+    from nmpm.zoo.measures.scenes import simulator_of
 
     model = load_model(arguments.model, arguments.device, arguments.root).optimized(arguments.runtime)
     choose_threads(model, arguments.threads)
@@ -101,11 +102,9 @@ def _load(arguments: argparse.Namespace) -> ModelUnderTest:
             f"{arguments.model}: these tests are of closed boxes, and the model's scenes have open axes."
             " `nmpm compare` and `nmpm rollout --data` measure it on recordings."
         )
-    preset = arguments.preset or (model.preset if model.preset in preset_names() else None)
+    preset = load_preset(arguments.preset) if arguments.preset else simulator_of(model)
     emulator = model.emulator.unconstrained() if arguments.free else model.emulator
-    return ModelUnderTest(
-        arguments.model, emulator, model.horizon, load_preset(preset) if preset else None, arguments.seed
-    )
+    return ModelUnderTest(arguments.model, emulator, model.horizon, preset, arguments.seed)
 
 
 def _run_groups(model: ModelUnderTest, effort: Effort, groups: list[str]) -> list[TestResult]:

@@ -12,7 +12,7 @@ from nmpm.errors import ConfigError, ZooError
 from nmpm.evaluation.bootstrap import interval
 from nmpm.zoo import Zoo
 from nmpm.zoo.entries import read_scenes
-from nmpm.zoo.measures.scenes import iterate_test_scenes
+from nmpm.zoo.measures.scenes import iterate_test_scenes, simulator_of
 from nmpm.zoo.verification import TOLERANCE, golden_distance, verify, verify_entry
 
 SHIPPED = shipped_folder("zoo")
@@ -35,6 +35,12 @@ def test_errors_on_recorded_data_are_measured_again_where_the_data_are(recorded)
     assert all(check.passed for check in verify_entry(SHIPPED / "waterdrop", data=recorded / "deepmind-waterdrop"))
     with pytest.raises(ConfigError, match="recorded data"):
         list(verify_entry(SHIPPED / "waterdrop"))
+
+
+@pytest.mark.parametrize("name", SIMULATED)
+def test_the_simulator_of_a_shipped_model_makes_its_scenes_whatever_the_shipped_preset_has_become(name):
+    model = Zoo.load(name, SHIPPED)
+    assert simulator_of(model).scene == model.scene
 
 
 @pytest.mark.parametrize("name", ["input_std", "output_scale"])

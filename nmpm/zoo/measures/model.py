@@ -16,10 +16,9 @@ from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.evaluation.prediction_errors import Measures, measure_errors
 from nmpm.evaluation.stress import GROUPS, QUICK, ModelUnderTest, TestResult, battery
 from nmpm.particles import Window
-from nmpm.sim import load_preset, preset_names
 from nmpm.viz import write_snapshots
 from nmpm.zoo.card import stress_digest
-from nmpm.zoo.measures.scenes import iterate_test_scenes
+from nmpm.zoo.measures.scenes import iterate_test_scenes, simulator_of
 from nmpm.zoo.pretrained import Pretrained
 
 FIRST, WORST = "rollout.png", "worst.png"
@@ -59,8 +58,7 @@ def quality_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[st
 
 def stress_facts(model: Pretrained) -> dict[str, Any]:
     """The keys `stress` and `stress_free` of a card, see `nmpm stress`; takes minutes, for SPH more than an hour."""
-    preset = load_preset(model.preset) if model.preset in preset_names() else None
-    return _stress(ModelUnderTest(model.name, model.emulator, model.horizon, preset, 0), "quick")
+    return _stress(ModelUnderTest(model.name, model.emulator, model.horizon, simulator_of(model), 0), "quick")
 
 
 def invariant_facts(model: Pretrained) -> dict[str, Any]:

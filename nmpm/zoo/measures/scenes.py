@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from nmpm.data.loading.recording import Recording, RecordingReader, SplitRecordi
 from nmpm.data.simulation import SimulationRequest, same_test_scenes
 from nmpm.errors import ConfigError, ZooError
 from nmpm.particles import Window
-from nmpm.sim import Preset, SimulatedTrajectory, preset_from_dict
+from nmpm.sim import Preset, SimulatedTrajectory, load_preset, preset_from_dict, preset_names
 from nmpm.zoo.pretrained import Pretrained
 
 
@@ -69,6 +70,13 @@ def as_recording(model: Pretrained, preset: Preset, run: SimulatedTrajectory, se
     """A simulated trajectory as a recording of the model's scene."""
     stored = Trajectory(run.position, run.particle_type, run.attributes)
     return RecordingReader(preset_metadata(preset), model.scene).recording(stored, f"{preset.name}, seed {seed}")
+
+
+def simulator_of(model: Pretrained) -> Preset | None:
+    """The simulator of the scenes that a model was made for, as its card states it or else as shipped; None without."""
+    with suppress(ConfigError):
+        return simulation_of(model)[0]
+    return load_preset(model.preset) if model.preset in preset_names() else None
 
 
 def simulation_of(model: Pretrained) -> tuple[Preset, SimulationRequest]:
