@@ -276,12 +276,13 @@ class Motion:
     Args:
         rms: Root mean square of their speeds, in length per frame of the dataset.
         largest: Speed that all but the fastest 0.1% stay below, likewise.
-        gravity: Root mean square of the trajectories' gravity, in length per second squared; None where unknown.
+        gravity: As measured in free flight where the scene states none, in length per second squared; where gravity
+            varies, the root mean square of each component over the trajectories. None where it is unknown.
     """
 
     rms: float
     largest: float
-    gravity: float | None = None
+    gravity: tuple[float, ...] | None = None
 
 
 def check_field_names(names: Iterable[str]) -> None:

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from nmpm.data.facts import find_facts
 from nmpm.data.format import SPLITS, Metadata, Split, find_split
-from nmpm.data.gravity import trajectory_gravity
+from nmpm.data.gravity import Gravity, trajectory_gravity
 from nmpm.data.statistics import displacements
 from nmpm.scene import Motion
 
@@ -18,18 +19,25 @@ _QUANTILE = 0.999
 def measure_motion(folder: Path, metadata: Metadata) -> Motion:
     """Speeds of the moving particles, from 12 pairs of frames of each of up to 8 trajectories, evenly spaced.
 
-    Of the training's trajectories, or else those of another split.
+    Of the training's trajectories, or else those of another split. Gravity that is not stated is measured.
     """
     split = Split(find_split(folder, *SPLITS))
     indices = range(0, len(split), -(-len(split) // _TRAJECTORIES))
     speeds = np.concatenate([_speeds(split, index, metadata) for index in indices] or [np.zeros(1)])
-    pulls = [trajectory_gravity(split.attributes(index), metadata, split.where(index)) for index in indices]
-    squares = [float(np.square(pull).sum()) for pull in pulls if pull is not None]
     return Motion(
         rms=float(np.sqrt(np.square(speeds).mean())),
         largest=float(np.quantile(speeds, _QUANTILE)),
-        gravity=float(np.sqrt(np.mean(squares))) if squares else None,
+        gravity=_gravity(split, indices, metadata),
     )
+
+
+def _gravity(split: Split, indices: range, metadata: Metadata) -> Gravity | None:
+    """That of the trajectories, each component's root mean square; where none states any, as particles fall."""
+    stated = [trajectory_gravity(split.attributes(index), metadata, split.where(index)) for index in indices]
+    pulls = [pull for pull in stated if pull is not None]
+    if not pulls:
+        return find_facts(split, metadata).gravity.value
+    return pulls[0] if len(set(pulls)) == 1 else tuple(np.sqrt(np.mean(np.square(pulls), axis=0)).tolist())
 
 
 def _speeds(split: Split, index: int, metadata: Metadata) -> np.ndarray:

@@ -15,6 +15,7 @@ from nmpm.scene import Interval, Motion, Scene
 
 _SPACING = 1.5
 """Factor by which the spacing of particles may differ from the training's where the recipe states no range."""
+_SPACING_WEIGHT = 0.05
 _WEAK = 0.5
 """A model that is told gravity is matched to this share of its root mean square, or more."""
 
@@ -38,15 +39,18 @@ class Figures:
     def of(cls, scene: Scene, motion: Motion | None, widths: Sequence[float], stride: Fraction) -> Figures:
         """The figures on cells of some widths (D,), in the data's units, with so many frames of the data for one."""
         width, frames = mean_width(widths), float(stride)
-        gravity = _gravity_in_cells(scene, widths)
-        if gravity is None and motion and motion.gravity:
-            gravity = motion.gravity * scene.dt**2 / width
+        gravity = _gravity_in_cells(scene.gravity or (motion and motion.gravity), scene.dt, widths)
         return cls(
             gravity=None if gravity is None else gravity * frames**2,
             rms=motion.rms * frames / width if motion else None,
             largest=motion.largest * frames / width if motion else None,
             spacing=width / scene.particle_spacing,
         )
+
+    def scaled(self, factor: float) -> Figures:
+        """The figures on cells wider by a factor."""
+        gravity, rms, largest = (each and each / factor for each in (self.gravity, self.rms, self.largest))
+        return Figures(gravity, rms, largest, self.spacing * factor)
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,7 @@ class Experience:
         fastest: Speed up to which the model is calibrated, likewise.
         spacing: Distances between particles to a cell and axis, in the scene of the training.
         spacings: Fewest and most of them.
+        varied_spacing: Whether the training had all of these.
     """
 
     gravity: Interval | None
@@ -67,6 +72,7 @@ class Experience:
     fastest: float | None
     spacing: float
     spacings: Interval
+    varied_spacing: bool
 
     @classmethod
     def of(cls, emulator: Emulator) -> Experience:
@@ -75,7 +81,13 @@ class Experience:
         spacing = mean_width(emulator.grid.spacing) / scene.particle_spacing
         few, most = (n ** (1 / scene.dim) for n in stated) if stated else (spacing / _SPACING, spacing * _SPACING)
         spacings = min(few, spacing), max(most, spacing)
-        return cls(_gravities(emulator), _rms_speed(emulator), _fastest(emulator), spacing, spacings)
+        speeds = _rms_speed(emulator), _fastest(emulator)
+        return cls(_gravities(emulator), *speeds, spacing, spacings, varied_spacing=stated is not None)
+
+    @property
+    def spacing_weight(self) -> float:
+        """Weight of the squared logarithm of the spacing over the training's, beside `motion_weight`."""
+        return _SPACING_WEIGHT if self.varied_spacing else 1.0
 
     def motion_factor(self, data: Figures) -> float:
         """Gravity over the nearest that the model has seen; without any, speeds over the model's; 1 if unknown."""
@@ -88,6 +100,14 @@ class Experience:
         return data.largest / self.fastest if data.largest and self.fastest else 0.0
 
 
+def motion_weight(factor: float) -> float:
+    """Weight of the squared logarithm of gravity's or speeds' factor.
+
+    Too strong gravity is the smaller evil: flight is exact, and what moves too little per frame comes to rest early.
+    """
+    return 0.5 if factor > 1 else 1.0
+
+
 def clamp(value: float, low: float, high: float) -> float:
     """The value, or the nearer end of an interval that it is not in."""
     return max(low, min(value, high))
@@ -98,15 +118,16 @@ def mean_width(widths: Sequence[float]) -> float:
     return widths[0] if len(set(widths)) == 1 else math.prod(widths) ** (1 / len(widths))
 
 
-def _gravity_in_cells(scene: Scene, widths: Sequence[float]) -> float | None:
-    if scene.gravity is None or not any(scene.gravity):
+def _gravity_in_cells(gravity: Sequence[float] | None, dt: float, widths: Sequence[float]) -> float | None:
+    """|g| Δt²/h; None where gravity is unknown or zero."""
+    if not gravity or not any(gravity):
         return None
-    return math.hypot(*(g / h for g, h in zip(scene.gravity, widths, strict=True))) * scene.dt**2
+    return math.hypot(*(g / h for g, h in zip(gravity, widths, strict=True))) * dt**2
 
 
 def _gravities(emulator: Emulator) -> Interval | None:
     if not emulator.scene.gravity_varies:
-        only = _gravity_in_cells(emulator.scene, emulator.grid.spacing)
+        only = _gravity_in_cells(emulator.scene.gravity, emulator.scene.dt, emulator.grid.spacing)
         return None if only is None else (only, only)
     rms = math.sqrt(_mean_square(emulator, "gravity_"))
     if not emulator.calibrated or not rms:

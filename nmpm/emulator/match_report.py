@@ -29,6 +29,7 @@ class MatchReport:
         stride: Frames of the data for one of the model.
         seen: The figures of the model's training.
         figures: Those of the data.
+        measured: Whether the data's gravity is not stated but measured.
         names: Of model and data.
     """
 
@@ -38,6 +39,7 @@ class MatchReport:
     stride: Fraction
     seen: Experience
     figures: Figures
+    measured: bool
     names: tuple[str, str]
 
     def lines(self) -> Iterator[str]:
@@ -82,7 +84,7 @@ class MatchReport:
         data, model = self.figures.gravity, self.seen.gravity
         told = model and self.model.scene.gravity_varies
         theirs = f"{model[0]:.3g} to {model[1]:.3g}" if model and told else _number(model and model[1])
-        both = f"{_number(data)} cells/frame² (model {theirs})"
+        both = f"{_number(data)} cells/frame²{' as measured' if self.measured else ''} (model {theirs})"
         if data and model:
             return f"{both}, factor {self.seen.motion_factor(self.figures):.3g}"
         if self.figures.rms and self.seen.rms:

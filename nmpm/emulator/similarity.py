@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from nmpm.emulator.experience import Experience, Figures, clamp, mean_width
+from nmpm.emulator.experience import Experience, Figures, clamp, mean_width, motion_weight
 from nmpm.emulator.match_report import MatchReport
 from nmpm.emulator.material_names import match_materials
 from nmpm.emulator.model import Emulator
@@ -28,8 +28,8 @@ STRIDES = tuple(Fraction(k) for k in _WHOLE) + tuple(Fraction(1, k) for k in _WH
 """Frames of the data for one of the model that are tried."""
 _SHIFTS = tuple(1 + 0.002 * i for i in sorted(range(-20, 21), key=abs))
 """Factors on the best size of cells that are tried, for walls as in the model's scenes."""
-_SPEED_COST, _SPACING_COST, _STRIDE_COST, _WALL_COST = 0.25, 0.1, 0.01, 0.01
-"""Weights of the other squared logarithms beside that of gravity, and of misfits of walls."""
+_SPEED_COST, _STRIDE_COST, _WALL_COST = 0.25, 0.01, 0.01
+"""Weights of the squared logarithms of speeds beyond the model's and of strides, and of misfits of walls."""
 _SAME_UNITS = 4.0
 """Factor between the distances of particles of scenes that may be in the same unit of length."""
 _MOST_CELLS = 4_000_000
@@ -83,11 +83,14 @@ def find_match(
         raise ConfigError(f"{names[0]} has {emulator.scene.dim} axes, {names[1]} {scene.dim}: no model for these data.")
     if stride is not None and (stride <= 0 or 1 not in (stride.numerator, stride.denominator)):
         raise ConfigError(f"stride = {stride}: give k or 1/k frames of the data for one of the model, k whole.")
+    measured = not scene.gravity_known and motion is not None and motion.gravity is not None
+    if measured and motion is not None:
+        scene = dataclasses.replace(scene, gravity=motion.gravity)
     mapping = match_materials(emulator.scene.materials, scene.materials, materials or {}, names)
     search = _Search(emulator, _with_channels_of(emulator.scene, scene), motion, Experience.of(emulator))
     recipe, chosen_stride = search.same_units(stride) or search.best(STRIDES if stride is None else (stride,), names)
     figures = Figures.of(scene, motion, recipe.grid.spacing, chosen_stride)
-    report = MatchReport(emulator.recipe, recipe, scene, chosen_stride, search.seen, figures, names)
+    report = MatchReport(emulator.recipe, recipe, scene, chosen_stride, search.seen, figures, measured, names)
     warnings = tuple(report.warnings())
     if strict and warnings:
         raise ConfigError(f"{' '.join(warnings)} Without strict these are warnings.")
@@ -155,22 +158,25 @@ class _Search:
         return self._recipe(grid, stride), stride
 
     def _scale(self, stride: Fraction) -> float:
-        """Length of the data for one of the model: by gravity, or else by speeds, among spacings that it has seen."""
+        """Length of the data for one of the model: of the least cost, if cells had no walls to fit.
+
+        At the model's spacing of particles, gravity or speeds are a factor too large. Where cells are wider by x, they
+        are a factor / x: w log²(factor / x) + w' log² x is least at x = factor ** (w / (w + w')).
+        """
         at_one = Figures.of(self.scene, self.motion, self.emulator.grid.spacing, stride)
-        scale = self.seen.spacing / at_one.spacing
-        if at_one.gravity and self.seen.gravity:
-            weakest, strongest = self.seen.gravity
-            scale = clamp(scale, at_one.gravity / strongest, at_one.gravity / weakest)
-        elif at_one.rms and self.seen.rms:
-            scale = at_one.rms / self.seen.rms
-        return clamp(scale, self.seen.spacings[0] / at_one.spacing, self.seen.spacings[1] / at_one.spacing)
+        usual = at_one.scaled(self.seen.spacing / at_one.spacing)
+        factor = self.seen.motion_factor(usual)
+        weight, spacing_weight = motion_weight(factor), self.seen.spacing_weight
+        spacing = usual.spacing * factor ** (weight / (weight + spacing_weight))
+        return clamp(spacing, *self.seen.spacings) / at_one.spacing
 
     def _cost(self, stride: Fraction, grid: SimilarGrid) -> float:
         figures = Figures.of(self.scene, self.motion, grid.widths, stride)
+        factor = self.seen.motion_factor(figures)
         return (
-            math.log(self.seen.motion_factor(figures)) ** 2
+            motion_weight(factor) * math.log(factor) ** 2
+            + self.seen.spacing_weight * math.log(figures.spacing / self.seen.spacing) ** 2
             + _SPEED_COST * math.log(max(1.0, self.seen.speed_excess(figures))) ** 2
-            + _SPACING_COST * math.log(figures.spacing / self.seen.spacing) ** 2
             + _STRIDE_COST * math.log(stride) ** 2
             + _WALL_COST * grid.misfit
         )
