@@ -39,7 +39,7 @@ class Figures:
     def of(cls, scene: Scene, motion: Motion | None, widths: Sequence[float], stride: Fraction) -> Figures:
         """The figures on cells of some widths (D,), in the data's units, with so many frames of the data for one."""
         width, frames = mean_width(widths), float(stride)
-        gravity = _gravity_in_cells(scene.gravity or (motion and motion.gravity), scene.dt, widths)
+        gravity = _gravity_in_cells(scene.gravity or (motion.gravity if motion else None), scene.dt, widths)
         return cls(
             gravity=None if gravity is None else gravity * frames**2,
             rms=motion.rms * frames / width if motion else None,
