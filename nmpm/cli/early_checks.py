@@ -98,6 +98,14 @@ def read_config(path: Path) -> Mapping[str, Any]:
         raise UsageError(f"--config {error}") from error
 
 
+def stated_keys(options: Sequence[Option], group: str) -> set[str]:
+    """Arguments behind --model.… or --data.… that options, or configurations that they name, state."""
+    configs = [read_config(Path(value)) for name, value in options if name == "--config" and value]
+    sections = [section for config in configs if isinstance(section := config.get(group), Mapping)]
+    given = [name for name, _ in options if name.startswith(f"--{group}.")]
+    return {str(key) for section in sections for key in section} | {name.split(".")[1] for name in given}
+
+
 def argument_names(group: str) -> set[str]:
     """Arguments behind --model.… or --data.…, read from the source."""
     names = set()

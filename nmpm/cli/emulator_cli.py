@@ -23,6 +23,7 @@ from nmpm._support.devices import device_name, find_device
 from nmpm._support.threads import stated_threads
 from nmpm.cli.console import BriefParser, explain, is_of_other_packages
 from nmpm.cli.early_checks import UsageError
+from nmpm.cli.matched_run import MatchedRun, add_arguments
 from nmpm.cli.options import check_folder
 from nmpm.cli.run_folder import CHECKPOINTS, SAVERS, RunFolder
 from nmpm.data.datamodule import TrajectoryDataModule
@@ -37,11 +38,10 @@ from nmpm.training.callbacks.outputs import PredictionWriter, ReportWriter
 from nmpm.training.callbacks.progress import Progress
 from nmpm.training.callbacks.savers import BestCheckpoint, LastCheckpoint
 from nmpm.training.callbacks.threads import Threads
-from nmpm.training.checkpoints import AtomicCheckpointIO, check_same_recipe, read_checkpoint
+from nmpm.training.checkpoints import AtomicCheckpointIO, read_checkpoint
 from nmpm.training.module import EmulatorModule
 from nmpm.training.optimization import check_learning_rate
 from nmpm.training.preflight import OVERALL, check_disk, check_memory, fitting_precision
-from nmpm.zoo.registry import load_model
 
 T = TypeVar("T")
 
@@ -54,7 +54,6 @@ THREADS = (
     "Of a CPU, which compute parts of a batch (default: OMP_NUM_THREADS; else the faster of one and all that may be"
     " used, as measured). Another number changes results by rounding."
 )
-START_FROM = "Model whose weights a new training starts with: a zoo name, a run or a checkpoint, of the same parts."
 
 
 class EmulatorCLI(LightningCLI):
@@ -86,8 +85,7 @@ class EmulatorCLI(LightningCLI):
             given = defaults | {"filename": name, "enable_version_counter": False}
             parser.set_defaults({f"{SAVERS[name]}.{key}": value for key, value in given.items()})
         parser.add_argument("--threads", type=PositiveInt | None, default=None, help=THREADS)
-        if self.command == "fit":
-            parser.add_argument("--start_from", type=str | None, default=None, help=START_FROM)
+        add_arguments(parser, self.command)
         parser.link_arguments("data.scene", "model.scene", apply_on="instantiate", compute_fn=self._model_scene)
         parser.link_arguments(("model.frames", "model.unroll"), "data.horizon", compute_fn=operator.mul)
 
@@ -137,6 +135,9 @@ class EmulatorCLI(LightningCLI):
                 check_folder(f"--{saver}.dirpath", Path(config[saver]["dirpath"]))
         if isinstance(optimizer, dict) or hasattr(optimizer, "get"):
             check_learning_rate((optimizer.get("init_args") or {}).get("lr"))
+        self.matched = MatchedRun.of(config, None if self.subcommand == "fit" else self.checkpoint_path())
+        if self.matched is not None:
+            self.matched.complete(config)
 
     def instantiate_classes(self) -> None:
         """Make data, model and trainer; ConfigError says what Lightning, or a package of loggers, does not take."""
@@ -199,11 +200,8 @@ class EmulatorCLI(LightningCLI):
         resumed = self._load_checkpoint()
         if resumed is not None:
             self.model.adopt_arguments(resumed)  # refuses another optimizer before data are simulated
-        elif config.get("start_from"):
-            emulator = self.model.emulator
-            initial = load_model(str(config["start_from"])).emulator.over(emulator.scene)
-            check_same_recipe(initial.recipe.to_dict(), emulator.recipe)
-            emulator.load_state_dict(initial.state_dict())
+        elif self.matched is not None:
+            self.model.emulator.load_state_dict(self.matched.model.emulator.state_dict())
             self._saver(BestCheckpoint).scores_start = True
         if rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
             return
@@ -216,7 +214,11 @@ class EmulatorCLI(LightningCLI):
             sys.stderr.write(contradictions_warning(self.datamodule.data_source))
 
     def before_validate(self) -> None:
-        self._load_checkpoint()
+        if self.matched is None:
+            self._load_checkpoint()
+        else:
+            self.model.emulator.load_state_dict(self.matched.model.emulator.state_dict())
+            self.config_init[self.subcommand]["ckpt_path"] = None  # its weights are of another form
         if not rank_zero_only.rank:  # type: ignore[attr-defined]  # (Lightning sets it)
             self._print_start()
 
@@ -228,8 +230,8 @@ class EmulatorCLI(LightningCLI):
         weights = sum(parameter.numel() for parameter in emulator.parameters())
         precision = "bfloat16 is emulated on this processor; training in float32.\n" if self.bfloat16_replaced else ""
         sys.stdout.write(
-            f"{self.note}Data: {self.datamodule.description}. Model: {type(emulator.recipe.processor).__name__},"
-            f" {weights:,} parameters, on {hardware}.\n{precision}{more}"
+            f"{self.note}{self.matched or ''}Data: {self.datamodule.description}. Model:"
+            f" {type(emulator.recipe.processor).__name__}, {weights:,} parameters, on {hardware}.\n{precision}{more}"
         )
         sys.stdout.flush()
 

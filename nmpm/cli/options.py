@@ -190,14 +190,14 @@ def data_options(options: argparse.Namespace) -> Options:
         find_family(options.family)
     return Options(
         family=options.family,
-        types=_parse("--types", options.types, _names, "ID=NAME pairs, e.g. 5=water,1=debris"),
-        static=_parse("--static", options.static, _ids, 'type ids, e.g. 1,3, or "none"'),
-        prescribed=_parse("--prescribed", options.prescribed, _ids, 'type ids, e.g. 2, or "none"'),
-        bounds=_parse("--bounds", options.bounds, _intervals, "LOW:HIGH for each axis, e.g. 0:1,0:0.5"),
+        types=parse_option("--types", options.types, _names, "ID=NAME pairs, e.g. 5=water,1=debris"),
+        static=parse_option("--static", options.static, _ids, 'type ids, e.g. 1,3, or "none"'),
+        prescribed=parse_option("--prescribed", options.prescribed, _ids, 'type ids, e.g. 2, or "none"'),
+        bounds=parse_option("--bounds", options.bounds, _intervals, "LOW:HIGH for each axis, e.g. 0:1,0:0.5"),
         dt=options.dt,
         gravity=gravity_option(options.gravity),
         boundary=options.boundary and options.boundary.split(","),
-        fields=_parse("--fields", options.fields, _field_names, "names, e.g. temperature,stiffness"),
+        fields=parse_option("--fields", options.fields, _field_names, "names, e.g. temperature,stiffness"),
         resample=options.resample,
         smooth=options.smooth,
     )
@@ -205,13 +205,15 @@ def data_options(options: argparse.Namespace) -> Options:
 
 def gravity_option(text: str | None) -> tuple[float, ...] | None:
     """The numbers of `--gravity`; raises ConfigError if they cannot be read."""
-    numbers: tuple[float, ...] | None = _parse("--gravity", text, _numbers, "a number for each axis, e.g. 0,-9.81")
+    numbers: tuple[float, ...] | None = parse_option(
+        "--gravity", text, _numbers, "a number for each axis, e.g. 0,-9.81"
+    )
     return numbers
 
 
 def new_ids(text: str | None) -> dict[int, int] | None:
     """The pairs of `--ids`; raises ConfigError if they cannot be read."""
-    pairs: dict[int, int] | None = _parse("--ids", text, _pairs, "OLD=NEW pairs of type ids, e.g. 5=0,3=1")
+    pairs: dict[int, int] | None = parse_option("--ids", text, _pairs, "OLD=NEW pairs of type ids, e.g. 5=0,3=1")
     return pairs
 
 
@@ -219,7 +221,8 @@ def _pairs(text: str) -> dict[int, int]:
     return {old: int(new) for old, new in _names(text).items()}
 
 
-def _parse(option: str, text: str | None, parse: Callable[[str], Any], expected: str) -> Any:
+def parse_option(option: str, text: str | None, parse: Callable[[str], Any], expected: str) -> Any:
+    """The value of an option's text, None of None; raises ConfigError, saying what is expected, if it is no such."""
     if text is None:
         return None
     try:

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm.cli.match_options import MatchOptions, add_match_options
 from nmpm.cli.options import (
     HelpFormatter,
     add_device_option,
@@ -27,6 +28,7 @@ from nmpm.errors import ConfigError
 if TYPE_CHECKING:
     from nmpm.emulator import Prescribed, Rollout
     from nmpm.particles import Particles, Window
+    from nmpm.scene import Scene
     from nmpm.zoo import Pretrained
 
 FRAMES = 400
@@ -37,6 +39,8 @@ examples:
   nmpm rollout goop --frames 400 --out out.h5            a zoo model, from thrown blocks
   nmpm rollout runs/goop --data test.h5 --trajectory 3   a run's best, from a recorded start
   nmpm rollout runs/grains --data grains.npz             or from any other form of data
+  nmpm rollout sandramps --data grains --materials big=sand,small=sand
+                                                         or from data of another kind
   nmpm rollout runs/goop/checkpoints/last.ckpt
   nmpm rollout goop --out splash.usda                    for Blender; .vtkhdf for ParaView, .csv, …
   nmpm rollout goop --device cuda --runtime auto         on a GPU, by CUDA graphs
@@ -47,22 +51,42 @@ def run(words: list[str]) -> None:
     """Run the command, e.g. ["rollout", "goop", "--frames", "400", "--out", "out.h5"]."""
     options = _parser().parse_args(words[1:])
     _check(options)
-    from nmpm.emulator import Prescribed
-    from nmpm.emulator.input_checks import warn_of_start_outside
     from nmpm.zoo.registry import load_model
 
-    model = load_model(options.model, options.device, options.root).optimized(options.runtime, options.precision)
-    choose_threads(model, options.threads)
-    window = None if options.data is None else _recorded(model, options)
-    recorded = 0 if window is None else window.target.shape[1]
-    state = _thrown_state(model, options) if window is None else window.initial
-    warn_of_start_outside(model.emulator, state.to(model.emulator.device))
-    prescribed = None if window is None else Prescribed.of(window)
-    rollout = _predict(model, state, prescribed, options.frames or recorded or FRAMES, options)
-    hint = _write(model, state, rollout, window if recorded else None, options)
-    if window is not None and recorded:
-        _print_errors(model, window, rollout, options)
+    model = load_model(options.model, options.device, options.root)
+    hint = _from_blocks(model, options) if options.data is None else _from_recording(model, options)
     sys.stdout.write(f"to look at them: {hint}\n")
+
+
+def _from_blocks(model: Pretrained, options: argparse.Namespace) -> str:
+    """Roll out from thrown blocks; return how to look at what is written."""
+    model = _optimized(model, options)
+    state = _thrown_state(model, options)
+    rollout = _predict(model, state, None, options.frames or FRAMES, options)
+    return _write(model, model.scene, state, rollout, None, options)
+
+
+def _from_recording(model: Pretrained, options: argparse.Namespace) -> str:
+    """Roll out from a recorded trajectory and print the errors; return how to look at what is written."""
+    from nmpm.cli.recorded_start import RecordedStart
+    from nmpm.emulator import Prescribed
+
+    start = RecordedStart.of(model, options)
+    model, written = _optimized(start.model, options), start.written
+    recorded = written.target.shape[1]
+    frames = options.frames or recorded or FRAMES
+    prescribed = Prescribed.of(start.window)
+    rollout = _predict(model, start.window.initial, prescribed, frames, options, start.between)
+    hint = _write(model, start.scene, written.initial, rollout, written if recorded else None, options)
+    if recorded:
+        _print_errors(start.scene, max(1, model.emulator.frames // start.between), written, rollout, options)
+    return hint
+
+
+def _optimized(model: Pretrained, options: argparse.Namespace) -> Pretrained:
+    model = model.optimized(options.runtime, options.precision)
+    choose_threads(model, options.threads)
+    return model
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -84,6 +108,7 @@ def _parser() -> argparse.ArgumentParser:
         " error",
     )
     add_split_option(parser, "--data")
+    add_match_options(parser)
     parser.add_argument("--trajectory", type=int, default=0, help="index in --data (default: 0, the first)")
     parser.add_argument("--seed", type=int, default=0, help="of the thrown blocks (default: 0)")
     parser.add_argument("--particles", type=int, default=1000, help="approximate number to throw (default: 1000)")
@@ -114,6 +139,9 @@ def _check(options: argparse.Namespace) -> None:
     """Check the numbers and paths before anything is loaded."""
     for name, least in (("frames", 1), ("threads", 1), ("particles", 1), ("blocks", 1), ("seed", 0), ("trajectory", 0)):
         check_at_least(f"--{name}", getattr(options, name), least)
+    match = MatchOptions.read(options.materials, options.stride, options.strict)
+    if options.data is None and match != MatchOptions():
+        raise ConfigError("--materials, --stride and --strict are about recorded data: give --data too.")
     if options.data is not None:
         check_exists("--data", options.data)
         if options.gravity is not None:
@@ -131,47 +159,41 @@ def _thrown_state(model: Pretrained, options: argparse.Namespace) -> Particles:
         raise ConfigError(f"--particles {options.particles}{blocks}: {error}") from error
 
 
-def _recorded(model: Pretrained, options: argparse.Namespace) -> Window:
-    from nmpm.data.convert import native_file
-    from nmpm.data.convert.native import file_metadata
-    from nmpm.data.format import Split
-    from nmpm.data.loading.padded_batch import collate
-    from nmpm.data.loading.recording import SplitRecordings
-    from nmpm.data.metadata import FAMILIES
-    from nmpm.emulator.fields import warn_of_ignored
-
-    deepmind = set(model.scene.materials) <= set(FAMILIES["deepmind"].types.values())
-    path, index = options.data, options.trajectory
-    split = Split(native_file(path, options.split))
-    metadata = file_metadata(split, "deepmind" if deepmind else None)
-    warn_of_ignored(model.scene, metadata.fields)
-    recordings = SplitRecordings(split, metadata, model.scene)
-    if index >= len(recordings):
-        raise ConfigError(f"--trajectory {index}: {path} contains trajectories 0 … {len(recordings) - 1}.")
-    if recordings.split.frames(index) < 2:
-        raise ConfigError(f"--trajectory {index}: it has one frame in {path}; a rollout starts from two.")
-    return collate([recordings[index]], model.scene)
-
-
 def _predict(
-    model: Pretrained, state: Particles, prescribed: Prescribed | None, frames: int, options: argparse.Namespace
+    model: Pretrained,
+    state: Particles,
+    prescribed: Prescribed | None,
+    frames: int,
+    options: argparse.Namespace,
+    between: int = 1,
 ) -> Rollout:
+    """So many frames, of which the model makes `between` each; all but every last of them are left out."""
     from nmpm._support.progress import progress_bar
     from nmpm.emulator import Rollout, stream_rollout
+    from nmpm.emulator.input_checks import warn_of_start_outside
     from nmpm.emulator.monitor import Monitor, Policy
 
-    monitor, parts = Monitor(Policy(options.watch)), []
-    with progress_bar("rollout", -(-frames // model.emulator.frames)) as step:
-        start, given = state.to(model.emulator.device), prescribed and prescribed.to(model.emulator.device)
-        for bundle in stream_rollout(model.emulator, start, frames, monitor, given):
-            parts.append(bundle.cpu())  # as a device may have less memory than a long rollout needs
+    monitor, parts, first, steps = Monitor(Policy(options.watch)), [], between - 1, frames * between
+    start, given = state.to(model.emulator.device), prescribed and prescribed.to(model.emulator.device)
+    warn_of_start_outside(model.emulator, start)
+    with progress_bar("rollout", -(-steps // model.emulator.frames)) as step:
+        for bundle in stream_rollout(model.emulator, start, steps, monitor, given):
+            kept = slice(first, None, between)
+            fields = {name: values[:, kept].cpu() for name, values in bundle.fields.items()}
+            parts.append(Rollout(bundle.position[:, kept].cpu(), fields))
+            first = (first - bundle.position.shape[1]) % between
             step()
     sys.stdout.write(monitor.report() + "\n")
     return Rollout.join(parts)
 
 
 def _write(
-    model: Pretrained, state: Particles, rollout: Rollout, window: Window | None, options: argparse.Namespace
+    model: Pretrained,
+    scene: Scene,
+    state: Particles,
+    rollout: Rollout,
+    window: Window | None,
+    options: argparse.Namespace,
 ) -> str:
     """Write the start and the prediction, beside what was recorded; return how to look at them."""
     from nmpm.data.described import described_metadata
@@ -180,7 +202,7 @@ def _write(
     origin = f"the zoo model {options.model}" if "sha256" in model.card else f"the model {options.model}"
     start = state.to("cpu")
     predicted = predicted_trajectory(
-        model.scene,
+        scene,
         start,
         rollout.position,
         origin,
@@ -196,7 +218,7 @@ def _write(
     return find_writer("--out", options.out).hint(file)
 
 
-def _print_errors(model: Pretrained, window: Window, rollout: Rollout, options: argparse.Namespace) -> None:
+def _print_errors(scene: Scene, bundle: int, window: Window, rollout: Rollout, options: argparse.Namespace) -> None:
     """Print the errors against a recording beside those of the trivial predictors, over the frames that both have."""
     from rich.console import Console
 
@@ -205,7 +227,7 @@ def _print_errors(model: Pretrained, window: Window, rollout: Rollout, options: 
     from nmpm.metrics import MSE
 
     frames = min(window.target.shape[1], rollout.position.shape[1])
-    comparison = Comparison(model.scene, [MSE()], model.emulator.frames)
+    comparison = Comparison(scene, [MSE()], bundle)
     fields = {name: values[:, :frames] for name, values in rollout.fields.items()}
     comparison.update(window.first(frames + 2), rollout.position[:, :frames], fields)
     figures = {name: float(value) for name, value in comparison.compute().items()}

@@ -24,6 +24,7 @@ from nmpm._support.messages import one_line
 from nmpm._support.plain_data import load_plugins
 from nmpm.cli.console import quiet_lightning
 from nmpm.cli.emulator_cli import EmulatorCLI
+from nmpm.cli.match_options import MatchOptions
 from nmpm.cli.run_folder import CHECKPOINTS, CONFIG, SAVERS
 from nmpm.errors import ConfigError
 
@@ -107,7 +108,8 @@ class RunConfig(SaveConfigCallback):
             return
         config, root = self.config.clone(), Path(self.config["trainer"]["default_root_dir"])
         config["ckpt_path"] = None
-        config.pop("start_from", None)  # unknown to other commands, and of the start alone
+        for name in ("start_from", *MatchOptions._fields):  # of the start alone
+            config.pop(name, None)
         for saver in SAVERS.values():
             folder = Path(config[saver]["dirpath"])
             config[saver]["dirpath"] = None if folder == root / CHECKPOINTS else str(folder.absolute())

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm.cli.match_options import MatchOptions, add_match_options
 from nmpm.cli.options import (
     MODEL,
     HelpFormatter,
@@ -20,6 +22,9 @@ from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
     from nmpm.emulator import Emulator
+    from nmpm.emulator.similarity import Match
+    from nmpm.evaluation.matched import MatchFinder
+    from nmpm.scene import Motion, Scene
 
 DESCRIPTION = """Measure the trade between speed and accuracy: time and errors of emulators, of the simulator with fewer
 substeps and on coarser grids, and of trivial predictors, on the same test scenes and machine. Answers what to run for
@@ -30,7 +35,7 @@ examples:
   nmpm trade goop                               the zoo's models of goop beside its simulator
   nmpm trade goop --models goop runs/a runs/b   models of your own beside it
   nmpm trade goop --predictors mine:make        a predictor of another package: make(scene) gives it
-  nmpm trade FOLDER --models runs/mine          recorded data in native layout: without a simulator
+  nmpm trade FOLDER --models runs/mine          recorded data of any form: without a simulator
   nmpm trade --print_config > sweep.yaml        what is measured; edit it, then:
   nmpm trade goop --config sweep.yaml
 
@@ -61,7 +66,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="nmpm trade", description=DESCRIPTION, epilog=_EXAMPLES, formatter_class=HelpFormatter
     )
-    parser.add_argument("dataset", nargs="?", help="an embedded dataset (goop, …), or a folder in native layout")
+    parser.add_argument("dataset", nargs="?", help="an embedded dataset (goop, …), or a file or folder of data")
     parser.add_argument("--models", nargs="*", metavar="MODEL", help=f"{MODEL} (default: the zoo's of this dataset)")
     parser.add_argument(
         "--predictors", nargs="*", default=[], metavar="MODULE:FACTORY[:ARGUMENT]",
@@ -81,10 +86,12 @@ def add_scene_options(parser: argparse.ArgumentParser, command: str, scenes: int
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help=f"folder to write to (default: {command}/DATASET)")
     add_device_option(parser)
+    add_match_options(parser)
 
 
 def measure_and_report(command: str, options: argparse.Namespace, dataset: str) -> None:
     """Measure the sweep of a command on a dataset, print the table, and write the report."""
+    match = MatchOptions.read(options.materials, options.stride, options.strict)
     check_at_least("--scenes", options.scenes, 1)
     check_at_least("--wider", options.wider, 2)
     check_device(options.device)
@@ -109,7 +116,7 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
         scenes = trade.find_wider_scenes(dataset, sweep.scenes, options.wider)
     else:
         scenes = trade.find_scenes(dataset, sweep.scenes)
-    choices = trade.make_choices(sweep, scenes, models, find_device(options.device), predictors)
+    choices = trade.make_choices(sweep, scenes, models, find_device(options.device), predictors, _finder(models, match))
     if not choices:
         raise ConfigError("There is nothing to measure: give --models, or settings of the simulator.")
     points = trade.measure(choices, scenes, sweep, trade.Store(out), command)
@@ -120,6 +127,28 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
         console.print(line, highlight=False, soft_wrap=True)
     paths = write_report(out, command, points, scenes)
     sys.stderr.write(f"wrote {', '.join(map(str, paths))}\n")
+
+
+def _finder(models: Mapping[str, Emulator], match: MatchOptions) -> MatchFinder:
+    """What matches each of the models: by the options, of which names of materials are for the models that have them.
+
+    Raises:
+        ConfigError: if no model has them.
+    """
+    from nmpm.emulator.similarity import find_match
+
+    named = set((match.materials or {}).values())
+    if models and not any(named <= set(emulator.scene.materials) for emulator in models.values()):
+        known = sorted({name for emulator in models.values() for name in emulator.scene.materials})
+        raise ConfigError(f"--materials: no model has {', '.join(sorted(named))}; they have {', '.join(known)}.")
+
+    def find(
+        emulator: Emulator, scene: Scene, motion: Motion | None = None, *, names: tuple[str, str] = ("", "")
+    ) -> Match:
+        materials = match.materials if named <= set(emulator.scene.materials) else None
+        return find_match(emulator, scene, motion, materials, match.stride, match.strict, names)
+
+    return find
 
 
 def _load_models(names: list[str]) -> dict[str, Emulator]:

@@ -17,6 +17,7 @@ from typing import Any
 
 import yaml
 
+from nmpm._support.shipped import PACKAGE
 from nmpm.cli import COMMANDS
 from nmpm.cli.early_checks import (
     NOT_FILES,
@@ -29,10 +30,16 @@ from nmpm.cli.early_checks import (
     read_config,
     read_options,
 )
+from nmpm.cli.match_options import MatchOptions
 from nmpm.cli.run_folder import CONFIG, RunFolder
 from nmpm.errors import ConfigError
 
+FINE_TUNING = PACKAGE / "cli" / "fine_tune.yaml"
+"""The configuration of fine-tunings that name none."""
 ROOT, CHECKPOINT = "--trainer.default_root_dir", "--ckpt_path"
+
+
+_REPLACED = {"--help_all": "--help", "--strict": "--strict=true"}
 
 
 def run(words: list[str]) -> int:
@@ -42,9 +49,10 @@ def run(words: list[str]) -> int:
         sys.stdout.write(training_help(command, COMMANDS[command][1]))
         return 0
     try:
-        options = read_options(["--help" if word == "--help_all" else word for word in words[1:]])
+        options = read_options([_REPLACED.get(word, word) for word in words[1:]])
         options, note = expand_run(command, options)
         check_options(options)
+        check_match_options(command, options)
         options = add_configuration(options) if command == "fit" else options
         from nmpm.cli.run_training import run_command
 
@@ -54,8 +62,20 @@ def run(words: list[str]) -> int:
         return 2
 
 
+def check_match_options(command: str, options: Sequence[Option]) -> None:
+    """Raise ConfigError if --materials or --stride cannot be read, or a training that starts from no model has them."""
+    given = {option.name: option.value for option in options}
+    MatchOptions.read(given.get("--materials"), given.get("--stride"))
+    if command == "fit" and "--start_from" not in given:
+        for name in ("--materials", "--stride", "--strict"):
+            if name in given:
+                raise ConfigError(f"{name} is of --start_from MODEL: data are matched to a model that there is.")
+
+
 def add_configuration(options: Sequence[Option]) -> list[Option]:
-    """The options with a configuration that is written for --data.path, where they name none.
+    """The options with a configuration for --data.path, where they name none.
+
+    That of fine-tunings where they start from a model, or else one that is written for the data.
 
     Raises:
         ConfigError: in one of several processes, which would write different ones.
@@ -64,6 +84,8 @@ def add_configuration(options: Sequence[Option]) -> list[Option]:
     path = given.get("--data.path")
     if path is None or path in NOT_FILES or "--config" in given or "--print_config" in given:
         return list(options)
+    if "--start_from" in given:
+        return _add_fine_tuning(options, Path(path))
     if any(int(os.environ.get(name) or 1) > 1 for name in ("WORLD_SIZE", "SLURM_NTASKS")):
         raise ConfigError(f"Several processes need one --config: write it first, by nmpm init {path}.")
     from nmpm.cli.init import MINUTES, dataset_name, write_for_fit
@@ -75,6 +97,16 @@ def add_configuration(options: Sequence[Option]) -> list[Option]:
     root = Path(given.get(ROOT) or f"runs/{dataset_name(Path(path))}")
     minutes = _minutes(given.get("--trainer.max_time") or "") or MINUTES
     return [Option("--config", str(write_for_fit(Path(path), Options(**stated), root, minutes))), *options]
+
+
+def _add_fine_tuning(options: Sequence[Option], path: Path) -> list[Option]:
+    """The options with the configuration of fine-tunings, and a run's folder of the dataset's name."""
+    from nmpm.cli.init import dataset_name
+
+    given = {option.name: option.value for option in options}
+    root = given.get(ROOT) or f"runs/{dataset_name(path)}"
+    RunFolder.of(Path(root), {}).check_new()
+    return [Option("--config", str(FINE_TUNING)), Option(ROOT, root), *options]
 
 
 def _minutes(time: str) -> float | None:
@@ -112,6 +144,8 @@ def expand_run(command: str, options: Sequence[Option]) -> tuple[list[Option], s
     config = _run_config(root)
     names = {option.name for option in others}
     implied = [] if ROOT in names else [Option(ROOT, run)]
+    if names & {"--data.path", "--data.name"} and _stated_value(config, "data.reading"):
+        implied.append(Option("--data.reading", "null"))  # it is that of the run's data
     if CHECKPOINT not in names:
         checkpoint = RunFolder.of(root, config).checkpoint(*(["last"] if command == "fit" else ["best", "last"]))
         implied.append(Option(CHECKPOINT, str(checkpoint)))
@@ -198,6 +232,8 @@ EXAMPLES = {
   nmpm fit --resume runs/goop                           go on after an interruption
   nmpm fit --config goop.yaml --trainer.max_time 00:00:05 --trainer.default_root_dir runs/short
   nmpm fit --data.path FOLDER                           on your own data, configured as by init
+  nmpm fit --start_from sandramps --data.path FOLDER --materials big=sand,small=sand
+                                                        ... from a pretrained model, in five minutes
   nmpm fit --config waterdrop.yaml --data.path FOLDER   on recorded data, by another""",
     "validate": """\
   nmpm validate runs/goop                               its best weights""",
@@ -211,7 +247,11 @@ EXAMPLES = {
 OPTIONS = {
     "--config FILE": "YAML; a name that is no file here is looked up among the shipped ones (nmpm --help lists them)",
     "--ckpt_path last|best|FILE": "a checkpoint of the run, or a file: fit goes on from it, the other commands run it",
-    "--start_from MODEL": "fit only: start with the weights of a zoo model, a run or a checkpoint of the same parts",
+    "--start_from MODEL": "fit only: start with a zoo model, a run or a checkpoint, with its cells, network and"
+    " constraints; without --config, train as fine-tunings do, for five minutes",
+    "--materials DATA=MODEL,...": "of a model on data of another kind: which of its materials each of the data's is",
+    "--stride K": "likewise: frames of the data for one of the model, such as 2 or 1/4 (default: what matches best)",
+    "--strict": "likewise: refuse data whose gravity, frames, particles, speeds or walls are not the model's",
     "--seed_everything N": "seed of all random numbers (default: 0)",
     "--print_config": "print the configuration that results, and stop",
 }

@@ -1,4 +1,4 @@
-"""`nmpm zoo list | card NAME | add RUN NAME | verify NAME | refresh NAME | push NAME ID | pull ID`."""
+"""`nmpm zoo list | card NAME | match DATA | add RUN NAME | verify NAME | refresh NAME | push NAME ID | pull ID`."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from nmpm._support.messages import one_line
+from nmpm.cli import zoo_match
 from nmpm.cli.options import HelpFormatter, add_device_option, check_device
 
 _ROOT = "folder of another zoo (default: your own, NMPM_HOME/zoo or ~/.cache/nmpm/zoo, and the shipped one)"
@@ -17,6 +18,7 @@ _EXAMPLES = """\
 examples:
   nmpm zoo list                            names, states, errors and data
   nmpm zoo card goop                       errors, times, training and known failures of one
+  nmpm zoo match grains                    which model to use, or to start from, for your own data
   nmpm zoo verify goop                     are the card's figures true here?
   nmpm zoo add runs/goop goop/mine --about "goop with a longer training"
   nmpm zoo push goop/mine me/goop          upload it, for nmpm zoo pull me/goop@main
@@ -52,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     card = add_command(_card, "errors, times, training and known failures of one model")
     card.add_argument("name", help=_MODEL)
     card.add_argument("--yaml", action="store_true", help="everything known of it, for programs")
+    zoo_match.add_arguments(add_command(zoo_match.match, zoo_match.ABOUT))
     add = add_command(_add, "make an entry of your own zoo, or of --root, from a finished run")
     add.add_argument("run", type=Path, help="the run's folder, e.g. runs/goop")
     add.add_argument("name", help="name of the new model, e.g. goop/mine")

@@ -10,6 +10,7 @@ import torch
 from lightning.pytorch import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
 
+from nmpm._support.plain_data import from_plain
 from nmpm.data.convert import Options
 from nmpm.data.format import split_paths
 from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
@@ -74,12 +75,11 @@ class TrajectoryDataModule(LightningDataModule):
         limit_eval: Validate on the first `limit_eval` trajectories only.
         eval_batch_size: Trajectories per evaluation batch, of equal length each.
         generate: Options for the simulation of `name`: `counts` (trajectories per split), `frames`, `seed`, `workers`.
+        reading: How the data are read for a model, as plain data, see the attribute and `nmpm.scene.Reading`.
 
     Attributes:
         validated: Trajectories, the first of the valid split, that validations of a training use where `limit_eval`
             does not say it; None before that is decided, and for all. Kept in checkpoints.
-
-    Attributes:
         reading: How the data are read for a model, in whose frames the windows and `horizon` then are: with `every`
             they begin at any frame of the data, and with `between` count only what the data have. None, the default,
             for data as they are.
@@ -112,6 +112,7 @@ class TrajectoryDataModule(LightningDataModule):
         limit_eval: int | None = None,
         eval_batch_size: int = 8,
         generate: dict[str, Any] | None = None,
+        reading: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
         options = Options(
@@ -125,7 +126,7 @@ class TrajectoryDataModule(LightningDataModule):
             smooth=smooth,
         )
         self.data_source = make_source(path, name, source, options, generate)
-        self.reading: Reading | None = None
+        self.reading = None if reading is None else from_plain(Reading, reading, "data.reading")
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):
             if value is not None and value < 1:
                 raise ConfigError(f"{key} = {value} must be at least 1.")

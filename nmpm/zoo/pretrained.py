@@ -227,6 +227,10 @@ class Pretrained:
         match = match_data(self, data, materials, stride, strict)
         for warning in match.warnings:
             warnings.warn(warning, stacklevel=2)
+        return self.matched(match)
+
+    def matched(self, match: Match) -> Pretrained:
+        """The same weights for the data of a match, see `fit_to`."""
         return dataclasses.replace(self, emulator=self.emulator.matched(match), match=match)
 
     def over(self, scene: Scene) -> Pretrained:

@@ -21,6 +21,7 @@ from nmpm._support.messages import one_line
 from nmpm.emulator import Emulator, Prescribed, rollout
 from nmpm.emulator.prescribed import predict_from_entries, with_predicted
 from nmpm.errors import ConfigError, DataError
+from nmpm.evaluation.matched import MatchedPredictor
 from nmpm.evaluation.prediction_errors import energy_gain, recorded_energy_gain
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.particles import Particles
@@ -118,31 +119,38 @@ def require_finite(position: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ModelChoice(Choice):
-    """A trained emulator, in evaluation mode, on the choice's device."""
+    """A trained emulator, in evaluation mode, on the choice's device; `matched` predicts other kinds of scenes."""
 
     emulator: Emulator
+    matched: MatchedPredictor | None = None
     kind: Kind = Kind.MODEL
 
     @property
     def bundle(self) -> int:
-        return self.emulator.frames
+        return self.emulator.frames if self.matched is None else self.matched.bundle
 
     @property
     def identity(self) -> Mapping[str, Any]:
-        return {
+        identity = {
             "recipe": self.emulator.recipe.to_dict(),
             "weights": weights_digest(self.emulator.state_dict()),
             "device": self.device.type,
             "runtime": self.emulator.runtime.name,
         }
+        return identity | ({} if self.matched is None else {"reading": self.matched.identity})
 
     def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
         window = scenes.window(indices)
+        if (matched := self.matched) is not None:
+            there = window.to(self.device)
+            return lambda frames: matched.predict(there.first(frames + 2))
         state, prescribed = window.initial.to(self.device), Prescribed.of(window)
         given = prescribed and prescribed.to(self.device)
         return lambda frames: rollout(self.emulator, state, frames, prescribed=given)
 
     def computed_frames(self, frames: int) -> int:
+        if self.matched is not None:
+            return self.matched.computed_frames(frames)
         return -(-frames // self.emulator.frames) * self.emulator.frames  # whole bundles
 
 

@@ -19,11 +19,12 @@ from nmpm.data.generate import generate
 from nmpm.data.loading.padded_batch import collate, displacements
 from nmpm.data.loading.recording import Recording, SplitRecordings
 from nmpm.data.loading.sources import FolderSource
+from nmpm.data.motion import measure_motion
 from nmpm.data.scene_inference import infer_scene
 from nmpm.data.simulation import SimulationRequest
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Window
-from nmpm.scene import Scene
+from nmpm.scene import Motion, Scene
 from nmpm.sim import Preset, load_preset, preset_from_dict
 
 MOVING = 0.02
@@ -42,6 +43,7 @@ class Scenes:
         recordings: The trajectories, of at least 3 frames.
         preset: The simulator that made them; None if they were recorded, or made by an unknown simulator.
         seeds: Of each trajectory's initial state in the preset; empty without preset.
+        folder: Of the dataset, to measure speeds; None where they are not known.
     """
 
     name: str
@@ -49,6 +51,7 @@ class Scenes:
     recordings: tuple[Recording, ...]
     preset: Preset | None = None
     seeds: tuple[int, ...] = ()
+    folder: Path | None = None
 
     def __len__(self) -> int:
         return len(self.recordings)
@@ -74,6 +77,11 @@ class Scenes:
         """Indices of the predicted frames of the first scene that pictures show."""
         last = self.frames(0) - 1
         return sorted({round(share * last) for share in SHOWN})
+
+    @cached_property
+    def motion(self) -> Motion | None:
+        """How the particles of the dataset move; None where that is not known."""
+        return None if self.folder is None else measure_motion(self.folder, read_metadata(self.folder))
 
     @cached_property
     def digests(self) -> tuple[str, ...]:
@@ -143,7 +151,7 @@ def read_scenes(name: str, folder: Path, count: int) -> Scenes:
     split = Split(find_split(folder, "test"))
     recordings = SplitRecordings(split, metadata, scene).with_frames(3, "an evaluation")
     indices = recordings.indices[:count]
-    scenes = Scenes(name, scene, tuple(map(recordings.__getitem__, range(len(indices)))), preset)
+    scenes = Scenes(name, scene, tuple(map(recordings.__getitem__, range(len(indices)))), preset, folder=folder)
     if preset is None:
         return scenes
     seeds: list[Any] = [split.attributes(index).get("seed") for index in indices]

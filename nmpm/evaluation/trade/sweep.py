@@ -14,12 +14,13 @@ from typing import Any, Literal
 import torch
 
 from nmpm._support.bounded_files import parse_yaml
-from nmpm._support.digests import short_digest
 from nmpm._support.messages import counted
 from nmpm._support.plain_data import from_plain
 from nmpm.emulator import NETWORK_PRECISIONS, Emulator
+from nmpm.emulator.similarity import find_match
 from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import free_fall, still
+from nmpm.evaluation.matched import MatchedPredictor, MatchFinder
 from nmpm.evaluation.prediction_errors import Measures
 from nmpm.evaluation.trade.choices import (
     CPU,
@@ -31,6 +32,7 @@ from nmpm.evaluation.trade.choices import (
     SimulatorChoice,
     digest,
 )
+from nmpm.evaluation.trade.fitted import FittedModel, fit_to_scenes
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.scene import Scene
 from nmpm.sim import Preset
@@ -144,6 +146,7 @@ def make_choices(
     models: Mapping[str, Emulator],
     device: torch.device = CPU,
     predictors: Sequence[Callable[[Scene], Predictor]] = (),
+    find: MatchFinder = find_match,
 ) -> list[Choice]:
     """All choices of a sweep.
 
@@ -153,6 +156,7 @@ def make_choices(
         models: Trained emulators on the CPU, by name; those of other scenes are rebuilt for these.
         device: Where they compute.
         predictors: Make those of other packages.
+        find: Matches a model and scenes of another kind: `find_match`, or that with some of its arguments given.
 
     Raises:
         ConfigError: if a model cannot take the scenes, there is no such setting, or two choices have one name.
@@ -161,7 +165,7 @@ def make_choices(
     if scenes.preset is not None:
         choices += _simulator_choices(sweep.simulator, scenes.preset)
     for name, emulator in models.items():
-        choices += _model_choices(sweep.models, name, emulator, scenes, device)
+        choices += _model_choices(sweep.models, fit_to_scenes(name, emulator, scenes, find), scenes, device)
     some_enter = any(recording.present is not None for recording in scenes.recordings)
     bundles = [emulator.frames for emulator in models.values()] if some_enter else []
     predict_by = partial(PredictorChoice, enter_every=max(bundles, default=1))
@@ -219,29 +223,21 @@ def _simulator_choice(preset: Preset, factor: int, name: str = "", nudge: float 
     )
 
 
-def _model_choices(
-    settings: ModelSettings, model: str, emulator: Emulator, scenes: Scenes, device: torch.device
-) -> list[Choice]:
-    """All forms of a model, rebuilt for these scenes if it was trained on others, see `EmulatorRecipe.over`.
+def _model_choices(settings: ModelSettings, model: FittedModel, scenes: Scenes, device: torch.device) -> list[Choice]:
+    """All forms of a model.
 
     Forms that predict the same in the same way, such as those of a model without constraints, are listed once. The
     first of each setting is not part of a form's name.
 
     Raises:
-        ConfigError: if the model cannot take the scenes, naming it and the reason; if there is no such runtime.
+        ConfigError: if there is no such runtime.
     """
-    differing = emulator.scene.differences(scenes.scene)
-    facts = {"model": model + OTHER_SCENES * bool(differing), "weights": short_digest(emulator.state_dict())}
-    if differing:
-        facts["scenes_differ_in"] = ", ".join(differing)
-        try:
-            emulator = emulator.over(scenes.scene)
-        except ConfigError as error:
-            raise ConfigError(f"The model {model} cannot predict the scenes of {scenes.name}. {error}") from error
+    facts = {"model": model.name + OTHER_SCENES * bool(model.differing), "weights": model.weights}
+    facts |= {"scenes_differ_in": model.differing} if model.differing else {}
     forms: dict[str, Choice] = {}
     for variant in product(settings.precision, settings.constraints, settings.runtime):
         precision, constraints, runtime = variant
-        form = emulator.with_network(NETWORK_PRECISIONS[precision])
+        form = model.emulator.with_network(NETWORK_PRECISIONS[precision])
         form = (form if constraints == "held" else form.unconstrained()).to(device).with_runtime(runtime)
         first = settings.precision[0], settings.constraints[0], settings.runtime[0]
         name = ", ".join([facts["model"], *(part for part, usual in zip(variant, first, strict=True) if part != usual)])
@@ -251,6 +247,7 @@ def _model_choices(
             choice = ModelChoice(
                 name=name if batch == 1 else f"{name}, batch {batch}",
                 emulator=form,
+                matched=None if model.reading is None else MatchedPredictor(form, model.reading, scenes.scene),
                 settings=facts | varied,
                 batch=batch,
                 device=device,

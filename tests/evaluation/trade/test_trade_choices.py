@@ -1,6 +1,7 @@
 """Sweeps and the choices that they make: what these predict, and which are left out or refused."""
 
 import dataclasses
+from functools import partial
 from importlib.util import find_spec
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from nmpm._support.digests import short_digest
+from nmpm.emulator.similarity import find_match
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.trade import (
     Kind,
@@ -98,9 +100,20 @@ def test_a_model_of_other_scenes_gets_cells_of_the_same_size_and_is_named_so(sce
     assert {choice.settings["weights"] for choice in models} == {short_digest(narrow.state_dict())}
     assert "domain" in models[0].settings["scenes_differ_in"]
     assert (narrow.grid.shape, models[0].emulator.grid.shape) == ((4, 8), (8, 8))
-    other = tiny_emulator(dataclasses.replace(scenes.scene, dt=2 * scenes.scene.dt))
-    with pytest.raises(ConfigError, match=r"model other cannot predict the scenes of .* made for dt"):
-        make_choices(tiny_sweep(), scenes, {"other": other})
+
+
+def test_a_model_of_another_gravity_takes_the_scenes_at_a_stride_and_says_so_or_is_refused(scenes):
+    gravity = tuple(4 * g for g in scenes.scene.gravity)
+    other = tiny_emulator(dataclasses.replace(scenes.scene, gravity=gravity))
+    model = next(c for c in make_choices(tiny_sweep(), scenes, {"other": other}) if c.kind is Kind.MODEL)
+    assert model.settings["scenes_differ_in"] == "1 frame for 2 of the data, gravity × 1"
+    predicted, _ = model.predict(scenes, 0)
+    assert predicted.shape == scenes.window([0]).target.shape
+    assert model.computed_frames(3) == 4  # a bundle of two frames, two of the scenes each
+    assert dict(model.identity)["reading"]["every"] == 2
+    far = tiny_emulator(dataclasses.replace(scenes.scene, gravity=tuple(-g for g in gravity)))
+    with pytest.raises(ConfigError, match=r"model far cannot predict the scenes of .* turn the data"):
+        make_choices(tiny_sweep(), scenes, {"far": far}, find=partial(find_match, strict=True))
 
 
 def test_runtimes_are_choices_of_their_own(scenes):

@@ -1,0 +1,130 @@
+"""Trainings and evaluations of a model on data that need not be of its kind: its form, and how the data are read."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jsonargparse import Namespace
+from lightning.pytorch.cli import LightningArgumentParser
+
+from nmpm._support.plain_data import to_plain
+from nmpm.cli.early_checks import read_options, stated_keys
+from nmpm.cli.match_options import MATERIALS, STRICT, STRIDE, MatchOptions, describe
+from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.data.dataset import Dataset
+from nmpm.data.loading.sources import FolderSource
+from nmpm.emulator.similarity import Match
+from nmpm.errors import NmpmError
+from nmpm.evaluation.matched import is_plain
+from nmpm.scene import Scene
+from nmpm.training.checkpoints import COMPARED, read_checkpoint
+from nmpm.zoo.entries import load_checkpoint
+from nmpm.zoo.matching import match_data
+from nmpm.zoo.pretrained import Pretrained
+from nmpm.zoo.registry import load_model
+
+START_FROM = (
+    "Model that a new training starts with: a zoo name, a run or a checkpoint. Cells, network, transfer, decoder and"
+    " constraints are the model's."
+)
+FORM = (*COMPARED, "constraints", "particles_per_cell")
+"""Arguments of --model.… that are the model's."""
+
+
+def add_arguments(parser: LightningArgumentParser, command: str) -> None:
+    """Add the options --materials, --stride and --strict, and --start_from of trainings."""
+    for name, text in (("materials", MATERIALS), ("stride", STRIDE)):
+        parser.add_argument(f"--{name}", type=str | None, default=None, help=text)
+    parser.add_argument("--strict", type=bool, default=False, help=STRICT)
+    if command == "fit":
+        parser.add_argument("--start_from", type=str | None, default=None, help=START_FROM)
+
+
+@dataclass(frozen=True)
+class MatchedRun:
+    """A model that a training starts from, or whose checkpoint is evaluated on other data.
+
+    Args:
+        model: On the data.
+        match: With them.
+        scene: Of the data, as they are.
+        left_out: Arguments of the configuration that the model's take the place of.
+    """
+
+    model: Pretrained
+    match: Match
+    scene: Scene
+    left_out: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, config: Namespace, checkpoint: Path | None) -> MatchedRun | None:
+        """The match of the model of `start_from`, or of a checkpoint where the data are not of its kind.
+
+        Raises:
+            ConfigError: if model and data cannot be matched.
+        """
+        start = config.get("start_from")
+        if (start is None or config["ckpt_path"]) and checkpoint is None:
+            return None
+        data = TrajectoryDataModule(**config["data"].as_dict())
+        if checkpoint is not None and not _is_of_another_kind(data.scene, checkpoint):
+            return None
+        model = load_model(str(start)) if checkpoint is None else load_checkpoint(checkpoint)
+        source = data.data_source  # of which nothing is simulated yet
+        described = Dataset(source) if isinstance(source, FolderSource) else source.scene
+        match = match_data(
+            model, described, *MatchOptions.read(config["materials"], config["stride"], config["strict"])
+        )
+        plain = match.recipe.to_dict()
+        stated = stated_keys(read_options(sys.argv[2:]), "model") if checkpoint is None else set()
+        left_out = [key for key in FORM if key in stated and _differs(config["model"][key], plain.get(key))]
+        return cls(model.matched(match), match, data.scene, tuple(left_out))
+
+    def __str__(self) -> str:
+        """Lines on how the model takes the data, and on what is left out of the configuration; none if neither."""
+        how = "" if self._is_same_kind else describe(self.match, self.model.name)
+        if not self.left_out:
+            return how
+        names = ", ".join(f"model.{name}" for name in self.left_out)
+        return f"{how}Left out of the configuration, as {self.model.name} has its own: {names}.\n"
+
+    @property
+    def _is_same_kind(self) -> bool:
+        return is_plain(self.match.reading) and self.match.reading.scene == self.scene
+
+    def complete(self, config: Namespace) -> None:
+        """Put the model's form, and how the data are read, into a configuration."""
+        plain = self.match.recipe.to_dict()
+        for key in FORM:
+            config["model"][key] = _namespace(plain.get(key))
+        if "horizon" in config["data"]:  # at least to the next frame that the data have
+            unroll = max(config["model"]["unroll"], -(-self.match.reading.between // plain["frames"]))
+            config["model"]["unroll"], config["data"]["horizon"] = unroll, plain["frames"] * unroll
+        if not self._is_same_kind:
+            reading = self.match.reading
+            config["data"]["reading"] = to_plain(reading) | {"scene": reading.scene.to_dict()}
+
+
+def _is_of_another_kind(scene: Scene, checkpoint: Path) -> bool:
+    """Whether today's rules refuse to evaluate a checkpoint on a scene; not for one that cannot be read."""
+    try:
+        stored = read_checkpoint(checkpoint).get("hyper_parameters", {}).get("scene")
+        return isinstance(stored, dict) and bool(Scene.from_dict(stored).differences(scene))
+    except NmpmError:  # is raised again when the checkpoint is loaded
+        return False
+
+
+def _namespace(plain: Any) -> Any:
+    """Mappings as jsonargparse's namespaces, nested ones too."""
+    if isinstance(plain, Mapping):
+        return Namespace(**{key: _namespace(value) for key, value in plain.items()})  # type: ignore[no-untyped-call]  # (jsonargparse has no types there)
+    return plain
+
+
+def _differs(configured: Any, value: Any) -> bool:
+    given = configured.as_dict() if isinstance(configured, Namespace) else configured
+    return bool(to_plain(given) != value)

@@ -1,0 +1,114 @@
+"""Starts of `nmpm rollout --data`: a recorded trajectory, and how a model takes it where it is of another kind."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+
+from nmpm.cli.match_options import MatchOptions, describe
+from nmpm.data.convert import Options, native_file
+from nmpm.data.convert.native import file_metadata
+from nmpm.data.dataset import Dataset
+from nmpm.data.facts import FOUND
+from nmpm.data.format import METADATA_FILE, Metadata, Split
+from nmpm.data.gravity import trajectory_gravity
+from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.recording import SplitRecordings
+from nmpm.data.loading.sources import FolderSource
+from nmpm.data.metadata import FAMILIES
+from nmpm.emulator.fields import warn_of_ignored
+from nmpm.errors import ConfigError, NmpmError
+from nmpm.particles import Window
+from nmpm.scene import Reading, Scene
+from nmpm.zoo import Pretrained
+from nmpm.zoo.matching import match_data
+
+SAME_GRAVITY = 0.05
+"""Share of the model's gravity by which that of data may differ, as it may be measured."""
+
+
+@dataclass(frozen=True)
+class RecordedStart:
+    """A trajectory that a rollout starts from.
+
+    Args:
+        model: The model, matched to the data where they are of another kind.
+        window: The trajectory at the model's frames, in its materials.
+        written: The trajectory at the frames that are written: those of the data, or every k-th of them where the
+            model's frames are so much longer; in the data's materials.
+        scene: Of `written`.
+        between: Frames of the model per written frame.
+    """
+
+    model: Pretrained
+    window: Window
+    written: Window
+    scene: Scene
+    between: int = 1
+
+    @classmethod
+    def of(cls, model: Pretrained, options: argparse.Namespace) -> RecordedStart:
+        """The trajectory of the options --data, --split and --trajectory; what matches it to the model is printed.
+
+        Raises:
+            ConfigError: if there is no such trajectory, or the model cannot be matched to the data.
+        """
+        path, index = options.data, options.trajectory
+        split = Split(native_file(path, options.split))
+        family = _family(split, model.scene)
+        metadata = file_metadata(split, family)
+        if index >= len(split):
+            raise ConfigError(f"--trajectory {index}: {path} contains trajectories 0 … {len(split) - 1}.")
+        if split.frames(index) < 2:
+            raise ConfigError(f"--trajectory {index}: it has one frame in {path}; a rollout starts from two.")
+        stated = MatchOptions.read(options.materials, options.stride, options.strict)
+        if stated.stride is None and is_of_kind(model.scene, metadata, split, index):
+            warn_of_ignored(model.scene, metadata.fields)
+            window = collate([SplitRecordings(split, metadata, model.scene)[index]], model.scene)
+            return cls(model, window, window, model.scene)
+        beside = (split.path.parent / METADATA_FILE).is_file()
+        data = Dataset(FolderSource(split.path.parent if beside else path, Options(family)))
+        match = match_data(model, data, *stated)
+        sys.stdout.write(describe(match, model.name))
+        scene = dataclasses.replace(data.scene, dt=data.scene.dt * match.reading.every)
+        window, written = (
+            collate([SplitRecordings(split, metadata, data.scene, reading=reading)[index]], reading.scene)
+            for reading in (match.reading, Reading(scene, every=match.reading.every))
+        )
+        return cls(model.matched(match), window, written, scene, match.reading.between)
+
+
+def _family(split: Split, scene: Scene) -> str | None:
+    """DeepMind's meaning of type ids, where the file does not state one and the model has materials of theirs."""
+    try:
+        file_metadata(split, None)
+    except NmpmError:
+        return "deepmind" if set(scene.materials) <= set(FAMILIES["deepmind"].types.values()) else None
+    return None
+
+
+def is_of_kind(scene: Scene, metadata: Metadata, split: Split, index: int) -> bool:
+    """Whether a trajectory is of the kind of a model's scene: in its materials, units, frames, box and gravity.
+
+    What could only be guessed, of a file that states nothing, decides nothing where the box may be the model's.
+    """
+    types = set(np.unique(split.particle_type(index)).tolist())
+    names = {metadata.particle_types[i] for i in metadata.moving_types if i in types}
+    if metadata.dim != scene.dim or not names <= set(scene.materials) or metadata.boundary != scene.boundary:
+        return False
+    guessed = {name for name, how in metadata.extra.get(FOUND, {}).items() if str(how).startswith("guessed")}
+    ours, theirs = np.array(scene.bounds if "bounds" not in guessed else scene.domain), np.array(metadata.bounds)
+    cell = float((ours[:, 1] - ours[:, 0]).max()) / 64
+    within = (theirs[:, 0] > ours[:, 0] - cell).all() and (theirs[:, 1] < ours[:, 1] + cell).all()
+    if not within or ("bounds" not in guessed and not np.allclose(theirs, ours, 0, cell)):
+        return False
+    gravity = trajectory_gravity(split.attributes(index), metadata, split.where(index))
+    if not np.isclose(metadata.dt, scene.dt, rtol=1e-3):
+        return gravity is None and "dt" in guessed
+    if scene.gravity_varies or gravity is None or scene.gravity is None:
+        return True
+    return bool(np.allclose(gravity, scene.gravity, rtol=0, atol=SAME_GRAVITY * float(np.abs(scene.gravity).max())))

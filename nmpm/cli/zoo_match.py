@@ -1,0 +1,93 @@
+"""`nmpm zoo match DATA`: all models on a few windows of a dataset, and which to start from."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from nmpm.cli.match_options import MatchOptions, add_reading_options
+from nmpm.cli.options import check_exists
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from nmpm.zoo.ranking import Standing, Trial
+
+ABOUT = "predict a few windows of your data by every model: which to use, and to start a fine-tuning from"
+EXAMPLES = """\
+examples:
+  nmpm zoo match grains
+  nmpm zoo match grains.npz --materials big=sand,small=sand
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command's arguments."""
+    parser.add_argument("data", type=Path, help="a dataset, of any format that nmpm convert reads")
+    add_reading_options(parser)
+
+
+def match(options: argparse.Namespace) -> None:
+    """Print the ranking, and the commands that go on with the best model."""
+    check_exists("DATA", options.data)
+    stated = MatchOptions.read(options.materials, options.stride)
+    from rich.console import Console
+
+    from nmpm._support.progress import progress_bar
+    from nmpm.data.dataset import Dataset
+    from nmpm.data.loading.sources import FolderSource
+    from nmpm.zoo.ranking import Trial, rank_models
+    from nmpm.zoo.registry import Zoo, load_model
+
+    trial = Trial.of(Dataset(FolderSource(options.data)))
+    names = Zoo.list(options.root)
+    loaders = {name: (lambda name=name: load_model(name, root=options.root).emulator) for name in names}
+    with progress_bar("models", len(names)) as step:
+        standings = rank_models(trial, loaders, stated.materials, stated.stride, step)
+    Console().print(_table(trial, standings))
+    best = next((one for one in standings if one.match is not None and math.isfinite(one.error)), None)
+    sys.stdout.write("".join(f"{line}\n" for line in _advice(options, trial, best)))
+
+
+def _table(trial: Trial, standings: Sequence[Standing]) -> Table:
+    from rich.table import Table
+
+    table = Table(
+        title=f"{trial.name}: errors at {trial.frames} frames over that of the better trivial predictor",
+        title_justify="left",
+    )
+    table.add_column("model")
+    for heading in ("error", "cells"):
+        table.add_column(heading, justify="right")
+    table.add_column("how it takes the data")
+    for one in standings:
+        cells = "" if one.match is None else "×".join(map(str, one.match.recipe.grid.shape))
+        how = [one.how, *(f"{name} as {theirs}" for name, theirs in (one.materials or {}).items())]
+        table.add_row(one.model, f"{one.error:.2g}" if math.isfinite(one.error) else "", cells, ", ".join(how))
+    for name, error in (("nothing moves", trial.still), ("free fall", trial.free_fall)):
+        table.add_row(name, f"{error / trial.trivial:.2g}")
+    return table
+
+
+def _advice(options: argparse.Namespace, trial: Trial, best: Standing | None) -> list[str]:
+    """What could not be matched of the best model, and the commands that use it."""
+    if best is None or best.match is None:
+        return ["No model takes these data: nmpm init writes a configuration for a training from nothing."]
+    lines = [f"warning: {warning}" for warning in best.match.warnings]
+    if best.error >= 1:
+        lines.append("No model is better than a trivial predictor; a fine-tuning may be.")
+    materials = {name: best.match.reading.materials.get(name, name) for name in trial.scene.materials}
+    renamed = [f"--materials={','.join(f'{name}={theirs}' for name, theirs in materials.items() if name != theirs)}"]
+    stated = [
+        *(renamed if best.match.reading.materials else []),
+        *([f"--stride={options.stride}"] if options.stride else []),
+    ]
+    data = str(options.data)
+    rollout, fit = ["rollout", best.model, "--data", data], ["fit", "--start_from", best.model, "--data.path", data]
+    lines += [f"as it is:         {shlex.join(['nmpm', *rollout, *stated])}"]
+    return [*lines, f"to start from it: {shlex.join(['nmpm', *fit, *stated])}"]

@@ -1,0 +1,202 @@
+"""Data in foreign units, with foreign names: commands match them to a model, say how, or refuse them."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from nmpm._support.shipped import shipped_folder
+from nmpm.cli import main
+from nmpm.data.format import Split, read_metadata, write_metadata, write_split
+from nmpm.zoo import Zoo
+from tests.made_up import made_up_metadata, made_up_trajectory
+
+LINES = ("cells", "frames", "gravity", "particles", "materials")
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    return tmp_path
+
+
+def write_foreign(frames: int = 32, every: int = 1, **changes) -> Path:
+    """Trajectories in millimetres and milliseconds of a material that no model has; frames are `every` of the zoo's."""
+    for name in ("train", "valid", "test"):
+        run = made_up_trajectory(frames * every, 9, seed=len(name), statics=4)
+        position = 1000 * run.position[::every] + 250
+        write_split(Path("grains", f"{name}.h5"), [run.__class__(position, run.particle_type, run.attributes)] * 2)
+    units = {"bounds": ((350.0, 1150.0),) * 2, "dt": 2.5 * every, "gravity": (0.0, -9.81e-3)}
+    names = {"particle_types": {3: "floor", 7: "steel"}, "particle_volume": 40.0}
+    write_metadata(Path("grains"), made_up_metadata(**(units | names | changes)))
+    return Path("grains")
+
+
+def said_lines(text: str) -> list[str]:
+    return [line.split()[0] for line in text.splitlines() if line.startswith("  ") and line.split()[0] in LINES]
+
+
+def test_a_rollout_takes_data_in_other_units_and_writes_their_frames_and_names(capsys):
+    data = write_foreign()
+    assert main(["rollout", "goop", "--data", str(data)]) == 0
+    said = capsys.readouterr().out
+    assert "goop takes these data as follows." in said
+    assert said_lines(said) == list(LINES)
+    assert "steel -> goop" in said
+    assert "30 frames" in said
+    assert "nothing moves" in said
+    recorded, written = Split(data / "test.h5").read(0).position, Split(Path("out.h5")).read(0)
+    assert written.position.shape == recorded.shape
+    np.testing.assert_allclose(written.position[:2], recorded[:2], rtol=1e-5)
+    assert json.loads(written.attributes["particle_types"])["100"] == "steel"
+    assert json.loads(written.attributes["scene"])["dt"] == 2.5
+
+
+def test_a_rollout_makes_frames_between_those_of_the_data_or_jumps_over_some(capsys):
+    data = write_foreign(every=4)
+    assert main(["rollout", "goop", "--data", str(data), "--out", "quarter.h5"]) == 0
+    said = capsys.readouterr().out
+    assert "1 frame of the model = 1/4 of the data" in said
+    assert "120 frames; most" in said
+    written = Split(Path("quarter.h5"))
+    assert written.frames(0) == 32
+    assert read_metadata(data).dt == json.loads(written.read(0).attributes["scene"])["dt"] == 10.0
+    assert main(["rollout", "goop", "--data", str(data), "--stride", "2", "--out", "second.h5"]) == 0
+    captured = capsys.readouterr()
+    assert "warning: Gravity of grains is" in captured.out + captured.err
+    recorded, jumped = Split(data / "test.h5").read(0).position, Split(Path("second.h5")).read(0)
+    np.testing.assert_allclose(jumped.position[:2], recorded[[0, 2]], rtol=1e-5)
+    assert len(jumped.position) == 16
+
+
+def test_strict_refuses_what_does_not_match(capsys):
+    data = write_foreign(gravity=(0.0, 9.81e-3))
+    words = ["rollout", "goop", "--data", str(data)]
+    assert main(words) == 0
+    assert "turn the data" in capsys.readouterr().out
+    assert main([*words, "--strict"]) == 1
+    assert "turn the data" in capsys.readouterr().err
+    fit = ["fit", "--start_from", "goop", "--data.path", str(data), "--strict"]
+    assert main(fit) == 1
+    assert "turn the data" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["rollout", "goop", "--data", ".", "--stride", "2/3"], "--stride 2/3: give a whole number"),
+        (["rollout", "goop", "--data", ".", "--materials", "big"], "--materials big: give DATA=MODEL pairs"),
+        (["rollout", "goop", "--materials", "big=sand"], "--materials, --stride and --strict are about recorded data"),
+        (["compare", "goop", "--data", ".", "--stride", "0"], "--stride 0: give a whole number"),
+        (["zoo", "match", "."], "--stride"),
+        (["fit", "--start_from", "goop", "--data.path", ".", "--materials", "a=b=c"], "--materials a=b=c: give"),
+        (["fit", "--data.path", ".", "--stride", "2"], "--stride is of --start_from MODEL"),
+    ],
+)
+def test_options_are_refused_before_torch_is_imported(words, message):
+    words = [*words, "--stride", "1/0"] if words[0] == "zoo" else words
+    code = f"import sys; from nmpm.cli import main; main({words!r}); sys.exit('torch' in sys.modules)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert message in run.stderr
+
+
+TINY = [
+    *("--trainer.max_steps", "2", "--trainer.val_check_interval", "2", "--data.batch_size", "2"),
+    *("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false", "--model.unroll", "1"),
+]
+
+
+def test_a_fine_tuning_needs_no_configuration_and_its_run_needs_no_zoo(capsys, monkeypatch):
+    data = write_foreign()
+    assert main(["fit", "--start_from", "goop", "--data.path", str(data), *TINY]) == 0
+    said = capsys.readouterr().out
+    assert said_lines(said) == list(LINES)
+    assert "Left out" not in said
+    run, goop = Path("runs/grains"), Zoo.load("goop").emulator.recipe
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    assert config["model"]["cells"] == list(goop.cells)
+    assert config["model"]["processor"] == goop.to_dict()["processor"]
+    assert config["model"]["constraints"] == goop.to_dict()["constraints"]
+    assert config["data"]["reading"]["materials"] == {"steel": "goop"}
+    assert not {"start_from", "materials", "stride", "strict"} & config.keys()
+    with monkeypatch.context() as without_zoo:
+        without_zoo.setattr("nmpm.cli.matched_run.load_model", None)
+        assert main(["fit", "--resume", str(run), "--trainer.max_steps", "3"]) == 0
+        assert main(["test", str(run)]) == 0
+    report = json.loads((run / "report.json").read_text())
+    assert report["training"]["steps"] == 3
+    assert 0 < report["test"]["mse"] < 1e6
+    assert main(["rollout", "runs/grains", "--data", str(data), "--frames", "4"]) == 0
+
+
+def test_a_run_is_tested_on_data_of_another_kind(capsys, make_dataset):
+    own = make_dataset(train=((30, 9),) * 2, valid=((30, 9),), test=((30, 9),), particle_volume=4e-5)
+    assert main(["fit", "--start_from", "goop", "--data.path", str(own), *TINY]) == 0
+    assert yaml.safe_load(Path("runs/dataset/config.yaml").read_text())["data"]["reading"] is None
+    assert said_lines(capsys.readouterr().out) == []
+    errors = []
+    for data in (own, write_foreign(30)):
+        assert main(["test", "runs/dataset", "--data.path", str(data)]) == 0
+        errors.append(json.loads(Path("runs/dataset/report.json").read_text())["test"]["mse"])
+    assert said_lines(capsys.readouterr().out) == list(LINES)
+    assert errors[1] > 1e4 * errors[0]  # in mm²
+
+
+def test_a_configuration_s_form_is_left_out_with_a_line(capsys):
+    data = write_foreign()
+    words = ["fit", "--config", "tutorial.yaml", "--start_from", "goop", "--data.path", str(data), *TINY]
+    assert main([*words, "--model.cells", "16", "--trainer.default_root_dir", "run"]) == 0
+    assert "Left out of the configuration, as goop has its own: model.cells" in capsys.readouterr().out
+    cells = yaml.safe_load(Path("run/config.yaml").read_text())["model"]["cells"]
+    assert cells == list(Zoo.load("goop").emulator.recipe.cells)
+
+
+def test_models_are_compared_on_data_of_another_kind(capsys, monkeypatch):
+    sweep = (
+        "{scenes: 2, timing: {rounds: 1, frames: 4}, models: {precision: [float32], constraints: [held], batch: [1]}}"
+    )
+    monkeypatch.setattr("nmpm.evaluation.trade.shipped_sweep_text", lambda _: sweep)
+    data = write_foreign(every=4)
+    words = ["compare", "goop", "multimaterial", "--data", str(data), "--out", "out"]
+    assert main(words) == 1
+    assert "State which is which: --materials steel=" in capsys.readouterr().err
+    assert main([*words, "--materials", "steel=clay"]) == 1
+    assert "no model has clay; they have goop, sand, water" in capsys.readouterr().err
+    assert main([*words, "--materials", "steel=sand"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert (
+        "goop (of other scenes): what differs from those of its training: 4 frames for 1 of the data, gravity" in said
+    )
+    assert "multimaterial (of other scenes): what differs" in said
+    assert "free fall" in said
+
+
+def test_models_of_a_zoo_are_ranked_by_what_they_predict_of_data(capsys):
+    for name in ("goop", "multimaterial", "waterdrop3d"):
+        shutil.copytree(shipped_folder("zoo") / name, Path("zoo", name))
+    data = write_foreign(24, every=2)
+    assert main(["zoo", "match", str(data), "--root", "zoo"]) == 0
+    said = capsys.readouterr().out
+    assert "grains: errors at 22 frames" in said
+    for row in ("goop", "multimaterial", "nothing moves", "free fall"):
+        assert row in said
+    assert "waterdrop3d" not in said
+    last = said.splitlines()[-1]
+    assert last.startswith("to start from it: nmpm fit --start_from ")
+    assert f"--data.path {data} --materials=steel=" in last
+
+
+@pytest.mark.slow
+def test_all_models_are_ranked_on_grains_of_another_program(recorded, capsys, monkeypatch):
+    monkeypatch.delenv("NMPM_HOME")
+    data = recorded / "third-party" / "lammps-grains"
+    assert main(["zoo", "match", str(data)]) == 0
+    said = capsys.readouterr().out
+    assert "errors at 32 frames" in said
+    assert "to start from it: nmpm fit --start_from" in said
