@@ -46,7 +46,9 @@ from nmpm.sim import load_preset, preset_from_dict
 
 LOOKS = (20, 50, 100, 150, 200, 250, 300, 400, 600, 800)
 """Steps after which errors are measured, beside the start and the end."""
-UNROLL, RANK = 2, 4
+RANK = 4
+HORIZON = 16
+"""Frames from which on errors count in the choice of the best weights."""
 
 
 @dataclass(frozen=True)
@@ -123,12 +125,16 @@ class Method:
     Args:
         prepare: Changes a module with the start's weights, given windows of the new data.
         rate: Learning rate of SOAP.
+        unroll: Bundles that a step predicts.
         steps: At most so many; 0 leaves it at what `prepare` does.
+        options: Further arguments of the module.
     """
 
     prepare: Callable[[EmulatorModule, list[Window]], None]
     rate: float
+    unroll: int = 2
     steps: int | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
 
 
 METHODS = {
@@ -136,12 +142,17 @@ METHODS = {
     "half": Method(_everything, 1e-3),
     "quarter": Method(_everything, 5e-4),
     "double": Method(_everything, 4e-3),
+    "short": Method(_everything, 2e-3, unroll=1),
+    "long": Method(_everything, 2e-3, unroll=4),
+    "augmented": Method(_everything, 2e-3, options={"jitter": 0.35, "mirror": (0,)}),
     "recalibrated": Method(_recalibrated, 2e-3),
     "last": Method(_last_layers, 4e-3),
     "low-rank": Method(_low_rank, 4e-3),
     "statistics": Method(_recalibrated, 1.0, steps=0),
     "nothing": Method(_from_nothing, 6e-3),
 }
+UNCHANGED = frozenset(METHODS) - {"recalibrated", "statistics", "nothing"}
+"""Methods before whose first step the model is as it was."""
 
 
 # A cell
@@ -152,10 +163,12 @@ class Cell:
     """One training.
 
     Args:
+        start: The model that it starts from.
         sample, count, method, seed: Of `SAMPLES` and `METHODS`; training trajectories.
         steps: Of the training.
     """
 
+    start: str
     sample: str
     count: int
     method: str
@@ -164,17 +177,17 @@ class Cell:
 
     @property
     def name(self) -> str:
-        return f"{self.sample}-{self.count}-{self.method}-{self.seed}"
+        return f"{self.start}-{self.sample}-{self.count}-{self.method}-{self.seed}"
 
 
 def run_cell(cell: Cell, data: Path, out: Path) -> None:
     """Train as a cell says, and write its errors."""
     torch.set_num_threads(1)
     torch.manual_seed(cell.seed)
-    method, sample = METHODS[cell.method], SAMPLES[cell.sample]
+    method = METHODS[cell.method]
     steps = cell.steps if method.steps is None else method.steps
     folder = first_trajectories(data / cell.sample, cell.count, out / "data" / f"{cell.sample}-{cell.count}")
-    module, loader = prepare(sample, method, folder, cell.seed)
+    module, loader = prepare(cell, folder)
     curve = Curve(steps, loader.val_dataloader(), loader.test_dataloader())
     curve.look(module, 0)
     if steps:
@@ -195,20 +208,26 @@ def run_cell(cell: Cell, data: Path, out: Path) -> None:
     write_json(out / "cells" / f"{cell.name}.json", result)
 
 
-def prepare(sample: Sample, method: Method, folder: Path, seed: int) -> tuple[EmulatorModule, TrajectoryDataModule]:
-    """The module that a method trains, and its data."""
-    start = Zoo.load(sample.start)
+def prepare(cell: Cell, folder: Path) -> tuple[EmulatorModule, TrajectoryDataModule]:
+    """The module that a cell trains, and its data."""
+    method, start = METHODS[cell.method], Zoo.load(cell.start)
     data = TrajectoryDataModule(
-        path=str(folder), horizon=start.emulator.frames * UNROLL, batch_size=4, emphasis=0.5, openings=0.3, seed=seed
+        path=str(folder),
+        horizon=start.emulator.frames * method.unroll,
+        batch_size=4,
+        emphasis=0.5,
+        openings=0.3,
+        seed=cell.seed,
     )
-    start = start.fit_to(data, materials=sample.materials or None)
+    start = start.fit_to(data, materials=SAMPLES[cell.sample].materials or None)
     data.reading = start.match.reading
     module = EmulatorModule.of(
         start.emulator,
-        unroll=UNROLL,
+        unroll=method.unroll,
         optimizer=lambda weights: SOAP([values for values in weights if values.requires_grad], lr=method.rate),
         schedule={"warmup": 20, "start": 0.1},
-        seed=seed,
+        seed=cell.seed,
+        **method.options,
     )
     method.prepare(module, list(islice(data.train_dataloader(), 4)))
     return module, data
@@ -224,8 +243,7 @@ class Curve(lightning.Callback):
 
     def look(self, module: EmulatorModule, step: int) -> None:
         emulator = module.emulator.eval()
-        horizon = emulator.frames * UNROLL
-        errors = {split: rollout_errors(emulator, windows, horizon) for split, windows in self.splits.items()}
+        errors = {split: rollout_errors(emulator, windows) for split, windows in self.splits.items()}
         self.rows.append({"step": step, "seconds": round(self.seconds, 2), **errors})
         module.train()
 
@@ -239,14 +257,14 @@ class Curve(lightning.Callback):
 
 
 @torch.no_grad()
-def rollout_errors(emulator: Emulator, windows: Iterable[Window], horizon: int) -> dict[str, float]:
+def rollout_errors(emulator: Emulator, windows: Iterable[Window]) -> dict[str, float]:
     """Errors of full rollouts by name: the model's, of which "overall" chooses weights, and trivial predictors'."""
     errors = Comparison(emulator.scene, [MSE()], emulator.frames)
     for window in windows:
         predicted = predict_rollout(emulator, window.initial, window.target.shape[1], prescribed=Prescribed.of(window))
         errors.update(window, predicted.position, predicted.fields)
     values = errors.compute()
-    return {name: float(value) for name, value in (values | {"overall": overall_error(values, horizon)}).items()}
+    return {name: float(value) for name, value in (values | {"overall": overall_error(values, HORIZON)}).items()}
 
 
 # Data
@@ -288,13 +306,14 @@ def simulate_goo(folder: Path, counts: Mapping[str, int], frames: int = 120) -> 
 
 def table(cells: Iterable[Mapping[str, Any]]) -> Iterator[str]:
     """Lines: errors as multiples of those of the model that the training starts with; medians over seeds."""
-    yield f"{'':<34}{'zero-shot':>10}{'20':>7}{'100':>7}{'end':>7}{'kept':>7}{'worst':>7}{'steps':>7}{'s/step':>7}"
-    groups: dict[tuple[str, int, str], list[Mapping[str, Any]]] = {}
+    yield f"{'':<44}{'zero-shot':>10}{'20':>7}{'100':>7}{'end':>7}{'kept':>7}{'worst':>7}{'steps':>7}{'s/step':>7}"
+    groups: dict[tuple[str, str, int, str], list[Mapping[str, Any]]] = {}
     for cell in cells:
-        groups.setdefault((cell["sample"], cell["count"], cell["method"]), []).append(cell)
-    zero = {sample: _zero_shot(group) for (sample, _, method), group in groups.items() if method != "nothing"}
-    for (sample, count, method), group in sorted(groups.items()):
-        start = zero.get(sample)
+        groups.setdefault((cell["start"], cell["sample"], cell["count"], cell["method"]), []).append(cell)
+    zero = {(name, sample): group[0]["curve"][0]["test"] for (name, sample, _, way), group in groups.items()
+            if way in UNCHANGED}  # fmt: skip
+    for (name, sample, count, method), group in sorted(groups.items()):
+        start = zero.get((name, sample))
         if start is None:
             continue
         columns = [[_at(cell, 20), _at(cell, 100), _at(cell, None), _kept(cell)] for cell in group]
@@ -303,15 +322,11 @@ def table(cells: Iterable[Mapping[str, Any]]) -> Iterator[str]:
         steps = group[0]["curve"][-1]["step"]
         pace = statistics.median(cell["seconds"] for cell in group) / max(steps, 1)
         shown = "".join(f"{ratio:>7.3f}" for ratio in (*ratios, worst))
-        what = f"{sample} {count} {method} ({len(group)})"
-        yield f"{what:<34}{1e3 * start['overall']:>10.4g}{shown}{steps:>7}{pace:>7.2f}"
-    for sample, start in zero.items():
+        what = f"{name} {sample} {count} {method} ({len(group)})"
+        yield f"{what:<44}{1e3 * start['overall']:>10.4g}{shown}{steps:>7}{pace:>7.2f}"
+    for (name, sample), start in zero.items():
         trivial = ", ".join(f"{name} {start[f'{name}/mse'] / start['mse']:.3g}" for name in ("still", "free_fall"))
-        yield f"{sample}: full-rollout MSE zero-shot {1e3 * start['mse']:.4g} x 1e-3; times that: {trivial}"
-
-
-def _zero_shot(group: list[Mapping[str, Any]]) -> dict[str, float]:
-    return group[0]["curve"][0]["test"]  # type: ignore[no-any-return]
+        yield f"{name} {sample}: full-rollout MSE zero-shot {1e3 * start['mse']:.4g} x 1e-3; times that: {trivial}"
 
 
 def _at(cell: Mapping[str, Any], step: int | None) -> float:
@@ -333,6 +348,7 @@ def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("--out", type=Path, required=True, help="folder of the results")
+    parser.add_argument("--start", help="model to start from (default: of each sample)")
     parser.add_argument("--samples", default="goo", help=f"of {', '.join(SAMPLES)}; default goo")
     parser.add_argument("--counts", default="1,3,10,30", help="training trajectories")
     parser.add_argument("--methods", default=",".join(METHODS), help="default: all")
@@ -359,7 +375,10 @@ def run_all(arguments: argparse.Namespace) -> None:
     if "goo" in samples and not (arguments.data / "goo").is_dir():
         simulate_goo(arguments.data / "goo", {"train": 30, "valid": 2, "test": 4})
     every = itertools.product(seeds, list(counts), samples, methods)
-    cells = [Cell(sample, count, method, seed, arguments.steps) for seed, count, sample, method in every]
+    cells = [
+        Cell(arguments.start or SAMPLES[sample].start, sample, count, method, seed, arguments.steps)
+        for seed, count, sample, method in every
+    ]
     waiting = [cell for cell in cells if not (arguments.out / "cells" / f"{cell.name}.json").is_file()]
     (arguments.out / "cells").mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(arguments.jobs) as pool:
