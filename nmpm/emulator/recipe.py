@@ -97,11 +97,12 @@ class EmulatorRecipe:
                 already; all else must be the same. Its fields are the emulator's, whatever the scene has.
 
         Raises:
-            ConfigError: if channels, time step or gravity differ, the domain is not a whole number of cells, or the
-                processor cannot take the grid.
+            ConfigError: if channels, time step, or gravity where the emulator's does not vary, differ, the domain is
+                not a whole number of cells, or the processor cannot take the grid.
         """
         scene = scene.with_fields_of(self.scene)
-        for name in ("input_channels", "dt", "boundary", "gravity"):
+        same_gravity = () if self.scene.gravity_varies else ("gravity",)  # states tell it where it varies
+        for name in ("input_channels", "dt", "boundary", *same_gravity):
             if getattr(scene, name) != getattr(self.scene, name):
                 raise ConfigError(
                     f"The emulator was made for {name} = {getattr(self.scene, name)}; the other scene has"

@@ -130,14 +130,17 @@ class _Search:
     seen: Experience
 
     def same_units(self, stride: Fraction | None) -> tuple[EmulatorRecipe, Fraction] | None:
-        """The model's cells for a scene in its units, with its gravity and time step; None for others."""
+        """The model's cells for a scene in its units, with its time step and gravity that it knows; None for others."""
         apart = self.scene.particle_spacing / self.emulator.scene.particle_spacing
         if stride not in (None, 1) or not 1 / _SAME_UNITS < apart < _SAME_UNITS:
             return None
         try:
-            return self.emulator.recipe.over(self.scene), Fraction(1)
+            recipe = self.emulator.recipe.over(self.scene)
         except ConfigError:
             return None
+        figures = Figures.of(self.scene, self.motion, recipe.grid.spacing, Fraction(1))
+        unseen = recipe.scene.gravity_varies and not math.isclose(self.seen.motion_factor(figures), 1.0)
+        return None if unseen else (recipe, Fraction(1))
 
     def best(self, strides: Sequence[Fraction], names: tuple[str, str]) -> tuple[EmulatorRecipe, Fraction]:
         """The form of the model, and the stride, of the least cost.

@@ -51,6 +51,13 @@ def test_a_scene_of_the_model_keeps_its_recipe():
     assert (match.reading.every, match.reading.between) == (1, 1)
 
 
+def test_a_model_that_is_told_gravity_keeps_its_cells_where_it_knows_the_gravity():
+    emulator = model_of(box(gravity=None, gravity_varies=True))
+    usual = find_match(emulator, box(gravity=(0.0, -9.81)))
+    assert (usual.recipe.cells, usual.recipe.scene.gravity) == (emulator.recipe.cells, (0.0, -9.81))
+    assert find_match(emulator, box(gravity=(0.0, -9.81e6))).recipe.cells != emulator.recipe.cells
+
+
 @pytest.mark.parametrize("scene", [box(), box(domain=((0.05, 0.95), (0.0, 0.92)))], ids=["even", "uneven"])
 def test_in_other_units_with_other_names_a_rollout_is_the_same(scene):
     emulator = model_of(scene)
