@@ -61,7 +61,7 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
     if not windows or min(window.target.shape[1] for window in windows) < emulator.frames:
         raise ValueError(f"Calibration needs windows of at least {emulator.frames + 2} frames.")
     windows = [window.to(emulator.device) for window in windows]
-    calibrate_fields(emulator.field_scales, windows)
+    calibrate_fields(emulator.field_scales, windows, emulator.scene.fields)
     inputs = _combine(all_gather(_inputs(emulator, windows)))
     materials = list(zip(*all_gather(_unknowns(emulator, windows)), strict=True))
     empty = [not any(part.particles for part in parts) for parts in materials[: len(emulator.scene.materials)]]
@@ -75,14 +75,52 @@ def calibrate(emulator: Emulator, windows: Sequence[Window]) -> None:
         )
     emulator.input_mean.copy_(_borrowed(inputs.mean, emulator.scene, absent).reshape_as(emulator.input_mean))
     emulator.input_std.copy_(_nonzero(_borrowed(inputs.std, emulator.scene, absent)).reshape_as(emulator.input_std))
-    # A channel that never varies in the sample may well do so elsewhere.
-    spread = inputs.high - inputs.low
-    margin = torch.where(spread > 1e-12, _MARGIN * spread, UNLIMITED)
-    emulator.input_low.copy_((inputs.low - margin).reshape_as(emulator.input_low))
-    emulator.input_high.copy_((inputs.high + margin).reshape_as(emulator.input_high))
+    low, high = _limits(inputs)
+    emulator.input_low.copy_(low.reshape_as(emulator.input_low))
+    emulator.input_high.copy_(high.reshape_as(emulator.input_high))
     scale = torch.cat([_root_mean_square(parts) for parts in _substituted(materials, emulator.scene)], dim=-1)
     emulator.output_scale.copy_(_nonzero(scale).reshape_as(emulator.output_scale))
     emulator.calibrated.fill_(True)
+
+
+@torch.no_grad()
+def unread_inputs(emulator: Emulator) -> list[int]:
+    """Indices of the input channels that the network does not read, as its weights for them are all 0: added ones."""
+    layers = emulator.processor.channel_layers
+    if layers is None:
+        return []
+    count = len(emulator.scene.input_channels)
+    weight = emulator.processor.get_parameter(f"{layers.first}.weight")
+    reads = weight[:, : count * layers.cells].unflatten(1, (count, layers.cells)).movedim(1, 0).flatten(1)
+    return [index for index, silent in enumerate((reads == 0).all(1).tolist()) if silent]
+
+
+@torch.no_grad()
+def calibrate_unread(emulator: Emulator, windows: Sequence[Window]) -> None:
+    """Set the statistics of inputs that the network does not read yet, from training windows; predictions stay.
+
+    Their mean is 0, so that scenes that have nothing there still look as before once the network reads them; what does
+    not occur in the windows keeps its statistics. Where several processes train together, all of them call this.
+    """
+    windows, names = [window.to(emulator.device) for window in windows], emulator.scene.input_channels
+    unread = unread_inputs(emulator)
+    read = {name.rpartition(".")[2] for index, name in enumerate(names) if index not in unread}
+    calibrate_fields(emulator.field_scales, windows, [name for name in emulator.scene.fields if name not in read])
+    inputs = _combine(all_gather(_inputs(emulator, windows)))
+    low, high = _limits(inputs)
+    size = (inputs.mean.square() + inputs.std.square()).sqrt()
+    for index in unread:
+        if size[index] > 1e-12:
+            emulator.input_mean[index], emulator.input_std[index] = 0.0, size[index]
+            emulator.input_low[index], emulator.input_high[index] = low[index], high[index]
+
+
+def _limits(inputs: _Inputs) -> tuple[Tensor, Tensor]:
+    """(C,) the limits to which inputs are clipped."""
+    # A channel that never varies in the sample may well do so elsewhere.
+    spread = inputs.high - inputs.low
+    margin = torch.where(spread > 1e-12, _MARGIN * spread, UNLIMITED)
+    return inputs.low - margin, inputs.high + margin
 
 
 @torch.no_grad()

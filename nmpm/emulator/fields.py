@@ -103,12 +103,13 @@ def warn_of_ignored(scene: Scene, given: Iterable[str]) -> None:
         )
 
 
-def calibrate_fields(scales: FieldScales, windows: Sequence[Window]) -> None:
-    """Set mean and standard deviation of each field from the real particles, or scenes, of training windows.
+def calibrate_fields(scales: FieldScales, windows: Sequence[Window], names: Sequence[str]) -> None:
+    """Set mean and standard deviation of some fields from the real particles, or scenes, of training windows.
 
     Where several processes train together, all of them call this. A field that the windows lack is left as it is.
     """
-    for index, name in enumerate(scales.scene.fields):
+    for name in names:
+        index = scales.scene.fields.index(name)
         values = [_values(window, name) for window in windows if name in window.fields]
         sums = [(part.numel(), part.sum().item(), part.square().sum().item()) for part in values]
         parts = [part for of_rank in all_gather(sums) for part in of_rank]

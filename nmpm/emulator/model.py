@@ -183,25 +183,15 @@ class Emulator(nn.Module):
 
     def over(self, scene: Scene) -> Emulator:
         """A copy of weights and statistics for another scene; raises as `EmulatorRecipe.over`."""
-        return self.rebuilt(self.recipe.over(scene))
+        from nmpm.emulator.adaptation import adapted  # imported late, as it imports this module
+
+        return adapted(self, self.recipe.over(scene))
 
     def matched(self, match: Match) -> Emulator:
         """A copy of weights and statistics for foreign data, see `nmpm.emulator.similarity.find_match`."""
         from nmpm.emulator.adaptation import adapted  # imported late, as it imports this module
 
         return adapted(self, match.recipe)
-
-    def rebuilt(self, recipe: EmulatorRecipe) -> Emulator:
-        """A copy of weights and statistics in an emulator of another recipe whose tensors have the same shapes."""
-        with torch.random.fork_rng(devices=[]):  # the weights drawn here are replaced
-            other = recipe.build().to(self.device)
-        if other.network_precision != self.network_precision:
-            other.processor.to(self.network_precision)
-        other.load_state_dict(self.state_dict())
-        for weight, original in zip(other.parameters(), self.parameters(), strict=True):
-            weight.requires_grad_(original.requires_grad)
-        other.runtime = copy.deepcopy(self.runtime)
-        return other.train(self.training)
 
     def context(self, particles: Particles) -> RolloutContext:
         """The context of a rollout from this state; warns of fields that the state lacks."""

@@ -22,7 +22,7 @@ from nmpm._support.digests import weights_digest
 from nmpm._support.plain_data import class_path
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, Prescribed, Rollout
-from nmpm.emulator.calibration import calibrate
+from nmpm.emulator.calibration import calibrate, calibrate_unread, unread_inputs
 from nmpm.emulator.fields import warn_of_ignored
 from nmpm.emulator.model import compile_network
 from nmpm.emulator.recipe import FORMAT, check_format
@@ -280,10 +280,11 @@ class EmulatorModule(EvaluatedModule):
                 " Trainer for another training, or give ckpt_path to go on with this one."
             )
         check_end(self.trainer)
-        if not self.emulator.calibrated:
+        if not self.emulator.calibrated or unread_inputs(self.emulator):
             self.trainer.fit_loop.setup_data()
             loader: Iterable[Window] = self.trainer.train_dataloader  # type: ignore[assignment]  # (loaded)
-            calibrate(self.emulator, list(islice(loader, CALIBRATION_BATCHES)))
+            set_statistics = calibrate_unread if self.emulator.calibrated else calibrate
+            set_statistics(self.emulator, list(islice(loader, CALIBRATION_BATCHES)))
         self._configured, self._rate_changed = True, False
         optimizer = build_optimizer(self.make_optimizer, self.emulator.parameters())
         total = total_steps(self.trainer)

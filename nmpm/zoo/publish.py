@@ -21,6 +21,7 @@ from nmpm._support.bounded_files import to_yaml
 from nmpm._support.digests import float32_digest
 from nmpm._support.shipped import PACKAGE, shipped_folder, user_zoo
 from nmpm.emulator import Emulator
+from nmpm.emulator.adaptation import adapted
 from nmpm.errors import ZooError
 from nmpm.training.checkpoints import load_module, read_checkpoint
 from nmpm.zoo.card import CARD, FORMAT, intervals, stress_digest
@@ -126,7 +127,7 @@ def round_network(emulator: Emulator) -> Emulator:
     Returns:
         A copy with rounded weights; the emulator itself where a rollout notices them.
     """
-    half = emulator.rebuilt(emulator.recipe)
+    half = adapted(emulator, emulator.recipe)
     weights = emulator.state_dict()
     half.load_state_dict({n: v.half().to(v.dtype) if _is_weight(n, v) else v for n, v in weights.items()})
     if not all(value.isfinite().all() for value in half.processor.state_dict().values()):

@@ -5,14 +5,15 @@ from functools import cache
 
 import pytest
 import torch
-from scenes import box, cloud, emulator_of
 
 from nmpm._support.shipped import shipped_folder
 from nmpm.emulator.adaptation import adapted
+from nmpm.emulator.calibration import calibrate_unread, unread_inputs
 from nmpm.errors import ConfigError
 from nmpm.processors import Identity, Patched, Pointwise, UNet
 from nmpm.transfer.execution import without_kernels
 from nmpm.zoo import Zoo
+from tests.scenes import box, cloud, emulator_of, window_of
 
 SHIPPED = shipped_folder("zoo")
 GRAVITY = {"gravity_varies": True, "gravity": None}
@@ -129,6 +130,35 @@ def test_added_inputs_are_not_clipped_and_have_a_spread_like_others():
     state = torch.full((1, len(std), *other.grid.shape), 3.0)
     added = [i for i, name in enumerate(other.scene.input_channels) if name not in emulator.scene.input_channels]
     assert (other.normalise(state) * other.input_std)[:, added].eq(3.0).all()
+
+
+def test_statistics_of_added_channels_come_from_the_data_and_predictions_stay():
+    emulator = emulator_of(box(), processor=UNet(width=4, depth=1, perceptron=(4,)))
+    emulator.calibrated.fill_(True)
+    other = over(emulator, {"materials": ("goop", "sand"), **GRAVITY, "evolving": ("heat",), "parameters": ("angle",)})
+    names = other.scene.input_channels
+    assert [names[i] for i in unread_inputs(other)] == [
+        name for name in names if name not in emulator.scene.input_channels
+    ]
+    state = dataclasses.replace(cloud(emulator.scene, batch=2), gravity=torch.tensor([[0.0, -6e-5], [6e-5, 0.0]]))
+    heat, angle = 300 + 10 * torch.arange(30.0).view(1, 1, 30), torch.tensor([[[20.0]], [[40.0]]])
+    window = window_of(state, state.position[:, None] + 0.001 * torch.arange(6.0).view(1, 6, 1, 1))
+    window = dataclasses.replace(window, fields={"heat": heat.expand(2, 1, 30), "angle": angle})
+    before, stds = frames(other, window.initial, ["goop"]), other.input_std.clone()
+    calibrate_unread(other, [window])
+    assert torch.equal(frames(other, window.initial, ["goop"]), before)
+    assert [name for name, old, new in zip(names, stds, other.input_std, strict=True) if old != new] == [
+        "gravity_x",
+        "gravity_y",
+        "goop.heat",
+        "angle",
+    ]
+    assert other.input_std[names.index("gravity_y")].item() == pytest.approx(
+        6e-5 / other.grid.spacing[1] / 2**0.5, rel=1e-3
+    )
+    assert not other.input_mean[names.index("gravity_y")]
+    torch.testing.assert_close(other.field_scales.mean, torch.tensor([445.0, 30.0]))
+    torch.testing.assert_close(other.field_scales.std, torch.tensor([heat.std(correction=0).item(), 10.0]))
 
 
 def test_other_networks_are_refused():

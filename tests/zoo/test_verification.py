@@ -8,6 +8,7 @@ import yaml
 
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
+from nmpm.emulator.adaptation import adapted
 from nmpm.errors import ConfigError, ZooError
 from nmpm.evaluation.bootstrap import interval
 from nmpm.zoo import Zoo
@@ -46,7 +47,7 @@ def test_the_simulator_of_a_shipped_model_makes_its_scenes_whatever_the_shipped_
 @pytest.mark.parametrize("name", ["input_std", "output_scale"])
 def test_statistics_that_are_not_applied_are_noticed(name):
     model = Zoo.load("goop", SHIPPED)
-    emulator = model.emulator.rebuilt(model.emulator.recipe)
+    emulator = adapted(model.emulator, model.emulator.recipe)
     getattr(emulator, name).mul_(1.1)
     assert golden_distance(dataclasses.replace(model, emulator=emulator.eval()), model.card["golden"]) > TOLERANCE
 

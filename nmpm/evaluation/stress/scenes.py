@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from nmpm.data.initial_states import lattice, state_at_rest, thrown_blocks
+from nmpm.emulator.adaptation import adapted
 from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.emulator.rollouts import rollout
 from nmpm.errors import ConfigError, UnstableError
@@ -152,7 +153,7 @@ def _with_cells(model: ModelUnderTest, name: str, factor: float, effort: Effort)
     emulator = model.emulator
     cells = tuple(max(1, round(factor * n)) for n in emulator.grid.shape)
     try:
-        other = emulator.rebuilt(dataclasses.replace(emulator.recipe, cells=cells))
+        other = adapted(emulator, dataclasses.replace(emulator.recipe, cells=cells))
     except ConfigError as error:
         return TestResult(_SIZES, f"grid {name}: {error}", None, {})
     if model.preset is None:
