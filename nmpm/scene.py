@@ -260,10 +260,6 @@ class Reading:
         """Frames of the dataset that a window of at least so many frames of the model needs, 3 or more."""
         return self.every * (frames - 1) + 1 if self.between == 1 else 2 + math.ceil((frames - 2) / self.between)
 
-    def elapsed(self, frames: int) -> int:
-        """Frames of the dataset that pass in so many frames of the model, rounded down; at least 1."""
-        return max(1, frames * self.every // self.between)
-
     def model_frames(self, frames: int) -> int:
         """Frames of the model that a window of so many frames of the dataset has; the first two are its start."""
         return (frames - 1) // self.every + 1 if self.between == 1 else 2 + self.between * (frames - 2)

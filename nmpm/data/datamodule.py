@@ -15,6 +15,7 @@ from nmpm.data.convert import Options
 from nmpm.data.format import split_paths
 from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
 from nmpm.data.loading.evaluation import EvaluationLoader
+from nmpm.data.loading.model_frames import check_horizon
 from nmpm.data.loading.padded_batch import pin_for
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.sources import SourceName, hold_out, make_source
@@ -201,11 +202,7 @@ class TrajectoryDataModule(LightningDataModule):
         history = self._history
         if history is None or history.start.batch > self.batches_seen:  # (the batch-size finder starts over)
             history = _BatchHistory(PlanStart(), self.batch_size, world)
-        if self.reading is not None and self.reading.between > self.horizon:
-            raise ConfigError(
-                f"The data have every {self.reading.between}th of the model's frames, none of the {self.horizon} that a"
-                f" training step predicts: unroll at least {self.reading.between} frames (model.unroll, data.horizon)."
-            )
+        check_horizon(self.horizon, self.reading)
         self._provider, plan = self.data_source.training_data(
             self.horizon + 2,
             self.reading,

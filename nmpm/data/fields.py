@@ -104,3 +104,15 @@ def require_fields(split: Split, names: Sequence[str]) -> None:
                     f"{split.where(index)}: it has no field {', '.join(missing)}, which the metadata's `fields` or"
                     f" data.fields name (it has: {', '.join(stored) or 'none'}). Correct the name, or leave it out."
                 )
+
+
+def check_finite(name: str, values: np.ndarray, moving: np.ndarray, where: str) -> None:
+    """Raises a DataError if a field (T, N') of the moving particles, (N,) of which N' are, is not finite."""
+    wrong = ~np.isfinite(values)
+    if wrong.any():
+        frame, index = map(int, np.argwhere(wrong)[0])
+        particle = int(np.flatnonzero(moving)[index])
+        raise DataError(
+            f"{where}: {name} of particle {particle} in frame {frame} is {values[frame, index]}; fields of moving"
+            " particles must be finite. Remove the trajectory, or leave the field out of data.fields."
+        )

@@ -102,3 +102,14 @@ def _constant(stored: Any) -> np.ndarray | None:
     low, high = np.fmin.reduce(values, axis=0), np.fmax.reduce(values, axis=0)
     changes = high - low > _CONSTANT * np.abs(high)
     return None if changes.any() else np.where(low > 0, low, np.nan)
+
+
+def check_positive(volume: np.ndarray, moving: np.ndarray, where: str) -> np.ndarray:
+    """The (N',) float32 volumes of the moving particles, of (N,) ones; a DataError if one is not positive."""
+    wrong = moving & ~((volume > 0) & np.isfinite(volume))
+    if wrong.any():
+        raise DataError(
+            f"{where}: the size of particle {int(np.argmax(wrong))} ({' or '.join(SIZES)}) is not a positive"
+            " number. Correct the field, or rename it if it is no size."
+        )
+    return np.asarray(volume[moving], dtype=np.float32)

@@ -95,7 +95,8 @@ class EvaluatedModule(LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         errors = self.valid_errors.compute()
-        overall = overall_error(errors, self.horizon if self.reading is None else self.reading.elapsed(self.horizon))
+        every, between = (1, 1) if self.reading is None else (self.reading.every, self.reading.between)
+        overall = overall_error(errors, max(1, self.horizon * every // between))  # in frames of the data
         self.log_dict({f"valid/{name}": value for name, value in (errors | {OVERALL: overall}).items()})
 
     def on_test_epoch_end(self) -> None:

@@ -12,10 +12,21 @@ import dataclasses
 import torch
 from torch import Tensor
 
+from nmpm.errors import ConfigError
 from nmpm.particles import Window
+from nmpm.scene import Reading
 
 _AT_REST = 1 / 8
 """Of the step that gravity alone gives: particles whose steps are shorter lie on something."""
+
+
+def check_horizon(horizon: int, reading: Reading | None) -> None:
+    """Raise ConfigError if the data have none of the model's frames that a training step predicts."""
+    if reading is not None and reading.between > horizon:
+        raise ConfigError(
+            f"The data have every {reading.between}th of the model's frames, none of the {horizon} that a training step"
+            f" predicts: unroll at least {reading.between} frames (model.unroll, data.horizon)."
+        )
 
 
 def add_frames(window: Window, between: int, has_earlier: Tensor) -> Window:

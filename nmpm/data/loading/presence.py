@@ -43,6 +43,17 @@ class Presence:
         return np.asarray(values[source, np.arange(values.shape[1])])
 
 
+def obstacle_frames(position: np.ndarray, moving: bool) -> np.ndarray:
+    """(T, M', D) positions of those of (T, M, D) obstacles that are ever there; where one is absent, it is as last.
+
+    Of one frame, T = 1, where obstacles do not move.
+    """
+    if not moving and not np.isnan(position[0]).any():
+        return position[:1]
+    presence = Presence.of(position)
+    return position if presence is None else presence.fill(position[:, presence.ever])
+
+
 def find_tracks(present: np.ndarray, ids: np.ndarray | None = None) -> np.ndarray:
     """(K, 3) tracks: the column that holds the particle, and the first and the last frame in which it is there.
 

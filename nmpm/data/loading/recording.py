@@ -3,16 +3,14 @@
 A recording holds what a model needs of a trajectory: the moving particles, their materials and fields, the obstacles,
 at rest or moving as recorded, and gravity in length per frame squared. Where a particle is absent, its position and its
 fields are those that it had last, or else will have first, so that all values are finite and no border of a period lies
-between them.
-
-Where data are read for a model (`nmpm.scene.Reading`), materials have the model's names, and gravity is in length per
-frame of the model squared. Frames stay those of the data until windows are gathered.
+between them. Data that are read for a model (`nmpm.scene.Reading`) have its materials, and gravity per frame of the model
+squared; frames stay those of the data until windows are gathered.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -22,13 +20,13 @@ from torch import Tensor
 
 from nmpm._support.threads import raise_if_abandoned
 from nmpm.data.array_checks import check_end
-from nmpm.data.fields import read_fields, require_fields
+from nmpm.data.fields import check_finite, read_fields, require_fields
 from nmpm.data.format import Metadata, Split, Trajectory, split_paths
 from nmpm.data.gravity import trajectory_gravity
-from nmpm.data.loading.presence import Presence, find_tracks
+from nmpm.data.loading.presence import Presence, find_tracks, obstacle_frames
 from nmpm.data.statistics import first_moving_particle, first_outside, without_those_gone
 from nmpm.data.times import check_times
-from nmpm.data.volumes import SIZES, mean_volume, stated_volumes, volumes
+from nmpm.data.volumes import check_positive, mean_volume, stated_volumes, volumes
 from nmpm.errors import DataError
 from nmpm.scene import Reading, Scene
 
@@ -91,31 +89,20 @@ class RecordingReader:
             presence.check(where)
             moving[moving] = presence.ever
             position = presence.fill(position[:, presence.ever])
-        obstacles = self._obstacles(trajectory.position, obstacle)
+        obstacles = obstacle_frames(trajectory.position[:, obstacle], self.scene.moving_obstacles)
         volume = stated_volumes(trajectory, self.scene.particle_volume, where) if volume is None else volume
         return Recording(
             frames=torch.from_numpy(np.ascontiguousarray(position)),
             material=torch.from_numpy(self._materials(types[moving], where)),
             obstacle=torch.from_numpy(obstacles[0]),
             gravity=(torch.tensor(gravity, dtype=torch.float64) * self.scene.dt**2).float(),
-            fields=dict(self._fields(trajectory.fields, moving, presence, where)),
+            fields=self._fields(trajectory.fields, moving, presence, where),
             present=None if presence is None else torch.from_numpy(presence.present),
             tracks=None if presence is None else find_tracks(presence.present, None if ids is None else ids[:, moving]),
             obstacle_frames=torch.from_numpy(obstacles) if self.scene.moving_obstacles else None,
-            volume=None if volume is None else _positive(volume, moving, where),
+            volume=None if volume is None else torch.from_numpy(check_positive(volume, moving, where)),
             reading=self.reading,
         )
-
-    def _obstacles(self, position: np.ndarray, obstacle: np.ndarray) -> np.ndarray:
-        """(T, M, D) positions of the obstacles that are ever there; of one frame, T = 1, where none of the scene moves.
-
-        Where one is absent, it is where it was last.
-        """
-        if not self.scene.moving_obstacles and not np.isnan(position[0, obstacle]).any():
-            return np.asarray(position[:1, obstacle])
-        frames = position[:, obstacle]
-        presence = Presence.of(frames)
-        return frames if presence is None else presence.fill(frames[:, presence.ever])
 
     def _check_rest(self, trajectory: Trajectory, where: str) -> None:
         types, metadata = trajectory.particle_type, self.metadata
@@ -156,24 +143,18 @@ class RecordingReader:
 
     def _fields(
         self, fields: Mapping[str, np.ndarray], moving: np.ndarray, presence: Presence | None, where: str
-    ) -> Iterator[tuple[str, Tensor]]:
+    ) -> dict[str, Tensor]:
         """The fields of the moving particles by name."""
         missing = [name for name in self.metadata.fields if name not in fields]
         if missing:
             raise DataError(f"{where}: it has no field {', '.join(missing)}, which the metadata or data.fields name.")
+        tensors = {}
         for name, stored in fields.items():
             values = stored if stored.shape[1] == 1 else stored[:, moving]
-            if presence is not None and values.shape == presence.present.shape:
-                values = presence.fill(values)
-            wrong = ~np.isfinite(values)
-            if wrong.any():
-                frame, index = map(int, np.argwhere(wrong)[0])
-                particle = int(np.flatnonzero(moving)[index])
-                raise DataError(
-                    f"{where}: {name} of particle {particle} in frame {frame} is {values[frame, index]}; fields of"
-                    " moving particles must be finite. Remove the trajectory, or leave the field out of data.fields."
-                )
-            yield name, torch.from_numpy(np.ascontiguousarray(values))
+            values = presence.fill(values) if presence and values.shape == presence.present.shape else values
+            check_finite(name, values, moving, where)
+            tensors[name] = torch.from_numpy(np.ascontiguousarray(values))
+        return tensors
 
     def _materials(self, types: np.ndarray, where: str) -> np.ndarray:
         index = np.zeros(types.shape, dtype=np.int64)
@@ -188,17 +169,6 @@ class RecordingReader:
                 )
             index[types == type_id] = self.scene.material_index(name)
         return index
-
-
-def _positive(volume: np.ndarray, moving: np.ndarray, where: str) -> Tensor:
-    """The (N',) volumes of the moving particles, of (N,) ones; a DataError if one is not positive."""
-    wrong = moving & ~((volume > 0) & np.isfinite(volume))
-    if wrong.any():
-        raise DataError(
-            f"{where}: the size of particle {int(np.argmax(wrong))} ({' or '.join(SIZES)}) is not a positive"
-            " number. Correct the field, or rename it if it is no size."
-        )
-    return torch.from_numpy(volume[moving].astype(np.float32))
 
 
 class SplitRecordings(Sequence[Recording]):

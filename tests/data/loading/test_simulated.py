@@ -8,9 +8,11 @@ import torch
 from nmpm._support.threads import AbandonedError, Task
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.loading.buffer import TrajectoryBuffer
+from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.simulated import SimulatedRecordings
 from nmpm.data.loading.window_plan import EndlessWindowPlan
 from nmpm.errors import ConfigError
+from nmpm.scene import Reading
 from nmpm.sim import MpmPreset, load_preset
 
 GOOP = load_preset("goop")
@@ -90,3 +92,16 @@ def test_calibration_and_training_share_their_trajectories_which_are_not_written
     assert len(next(iter(module.val_dataloader())).frames) == 1
     assert sorted(path.name for path in module.data_source.folder.glob("*.h5")) == ["test.h5", "valid.h5"]
     assert "simulated by nmpm while training" in module.description
+
+
+def test_a_reading_renames_materials_and_skips_frames():
+    scene = dataclasses.replace(TINY.scene, materials=("clay",), dt=2 * TINY.scene.dt)
+    recordings, (plain,) = live(), live().load([3])
+    recordings.read_for(Reading(scene, {"goop": "clay"}, every=2))
+    (read,) = recordings.load([3])
+    assert torch.equal(read.frames, plain.frames)
+    torch.testing.assert_close(read.gravity, 4 * plain.gravity)
+    window = collate([read], recordings.scene)
+    assert torch.equal(window.frames[0], plain.frames[::2])
+    recordings.read_for(None)
+    assert torch.equal(recordings.load([3])[0].gravity, plain.gravity)
