@@ -3,8 +3,8 @@
 A recording holds what a model needs of a trajectory: the moving particles, their materials and fields, the obstacles,
 at rest or moving as recorded, and gravity in length per frame squared. Where a particle is absent, its position and its
 fields are those that it had last, or else will have first, so that all values are finite and no border of a period lies
-between them. Data that are read for a model (`nmpm.scene.Reading`) have its materials, and gravity per frame of the model
-squared; frames stay those of the data until windows are gathered.
+between them. Read for a model (`nmpm.scene.Reading`), materials are its own, and gravity is per frame of the model
+squared, but frames are still those of the data.
 """
 
 from __future__ import annotations
@@ -160,8 +160,7 @@ class RecordingReader:
         index = np.zeros(types.shape, dtype=np.int64)
         renamed = {} if self.reading is None else self.reading.materials
         for type_id in np.unique(types).tolist():
-            name = self.metadata.particle_types[type_id]
-            name = renamed.get(name, name)
+            name = renamed.get(stated := self.metadata.particle_types[type_id], stated)
             if name not in self.scene.materials:
                 raise DataError(
                     f"{where}: the material {name!r} (type {type_id}) is not in the scene, which has"
