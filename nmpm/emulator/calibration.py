@@ -264,8 +264,11 @@ def gravity_range(emulator: Emulator) -> tuple[Tensor, Tensor]:
 def usual_gravity(emulator: Emulator) -> Tensor:
     """The gravity (D,), in length/s², to show a model with whose scenes differ in it.
 
-    Downwards along the second axis, as strong as in the root mean square of the training, within the calibrated range.
+    The scene's, if it states one; else downwards along the second axis, as strong as in the root mean square of the
+    training, within the calibrated range.
     """
+    if emulator.scene.gravity is not None:
+        return torch.tensor(emulator.scene.gravity, dtype=torch.float64)
     scale = torch.tensor(emulator.grid.spacing, dtype=torch.float64) / emulator.scene.dt**2
     mean, std = (
         channel_values(emulator, each, "gravity_") * scale for each in (emulator.input_mean, emulator.input_std)

@@ -107,7 +107,7 @@ class MatchReport:
             yield f"{data} has no gravity, but {model} learnt to fall by {seen.gravity[1]:.3g} cells/frame²."
         elif self.scene.gravity_varies and not told:
             yield f"Gravity differs between the scenes of {data}; {model} has seen one."
-        elif figures.gravity and not seen.gravity:
+        elif figures.gravity and not told:
             yield f"{data} has a gravity of {figures.gravity:.3g} cells/frame²; {model} has seen none."
         if figures.rms and seen.rms:
             if not 1 / _SPEED_FACTOR <= factor <= _SPEED_FACTOR:

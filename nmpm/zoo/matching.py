@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nmpm.data.dataset import Dataset, load_trajectories
+from nmpm.data.loading.sources import FolderSource, HoldOut
 from nmpm.data.motion import measure_motion
 from nmpm.emulator.similarity import Match, find_match
 from nmpm.errors import ConfigError
@@ -32,7 +33,9 @@ def match_data(
     if isinstance(data, str | Path):
         data = load_trajectories(data)
     source = data.source if isinstance(data, Dataset) else data.data_source
-    motion, names = measure_motion(source.folder, source.metadata), (model.name, source.description)
+    names = model.name, source.description
+    is_recorded = isinstance(source, FolderSource | HoldOut)  # simulated data state what is needed
+    motion = measure_motion(source.folder, source.metadata) if is_recorded else None
     return find_match(model.emulator, source.scene, motion, materials, step, strict, names)
 
 

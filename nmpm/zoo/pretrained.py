@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -38,7 +39,7 @@ from nmpm.zoo.card import preset_of
 from nmpm.zoo.matching import match_data
 from nmpm.zoo.optimization import AUTO, optimize
 from nmpm.zoo.starts import state_of
-from nmpm.zoo.states import Bodies, StateBuilder
+from nmpm.zoo.states import TOO_FAST, Bodies, StateBuilder
 
 if TYPE_CHECKING:
     from nmpm.data.datamodule import TrajectoryDataModule
@@ -132,7 +133,7 @@ class Pretrained:
             UserWarning: if the velocities look as if they were per frame, or particles start inside an obstacle; naming
                 fields that the model does not have.
         """
-        builder = StateBuilder(self.emulator, position, dtype)
+        builder = StateBuilder(self.emulator, position, dtype, math.inf if self.match else TOO_FAST)
         return builder.build(velocity, material, obstacle, gravity, fields, bodies, volume).to(self.emulator.device)
 
     def start(self, trajectory: Trajectory, frame: int = 1, materials: Mapping[str, str] | None = None) -> Particles:
@@ -207,22 +208,16 @@ class Pretrained:
             model = Zoo.load("sandramps").fit_to("grains", materials={"big": "sand", "small": "sand"})
             print(*model.match.lines)
 
-        Matched are gravity in cells per frame², or speeds where there is none, and the particles per cell. A scene in
-        this model's units, with its gravity and time step and a domain of whole cells, keeps the cells.
-
         Args:
             data: A scene; or a file or folder, a dataset of `nmpm.load_trajectories` or a datamodule, of which speeds
                 are measured, too.
             materials: This model's material by the data's name; those left out are told by their names.
             stride: Frames of the data for one of this model, such as 2 or "1/4"; the best one if left out.
-            strict: Whether to raise an error for what could not be matched, instead of a warning.
-
-        Raises:
-            ConfigError: if the numbers of axes differ, the materials cannot be told, the grid would be too large, or,
-                in strict mode, gravity, particles, speeds or boundaries are not this model's.
+            strict: Whether to raise a ConfigError for what could not be matched, see
+                `nmpm.emulator.similarity.find_match`.
 
         Warns:
-            UserWarning: for each of these that could not be matched, with its factor.
+            UserWarning: for each thing that could not be matched, with its factor.
         """
         match = match_data(self, data, materials, stride, strict)
         for warning in match.warnings:

@@ -25,7 +25,7 @@ Bodies = Sequence[Body] | Sequence[Sequence[Body]]
 """Obstacles of all scenes, or of each."""
 
 TOO_FAST = 2.0
-"""Speeds above this multiple of the calibrated range are errors."""
+"""Speeds above this multiple of the calibrated range are errors, unless the data have been compared with the model."""
 SUSPICIOUSLY_SLOW = 0.005
 """If no speed exceeds this fraction of the calibrated range, but speeds per frame would be within it, a warning."""
 
@@ -37,13 +37,14 @@ class StateBuilder:
         emulator: Gives the scene, and the range of velocities and gravity that it was calibrated for.
         position: (N, D) or (B, N, D).
         dtype: Floating-point type of the state.
+        too_fast: Speeds above this multiple of the calibrated range are errors.
 
     Raises:
         DataError: if the positions have another shape.
     """
 
-    def __init__(self, emulator: Emulator, position: Any, dtype: torch.dtype) -> None:
-        self.emulator, self.scene, self.dtype = emulator, emulator.scene, dtype
+    def __init__(self, emulator: Emulator, position: Any, dtype: torch.dtype, too_fast: float = TOO_FAST) -> None:
+        self.emulator, self.scene, self.dtype, self.too_fast = emulator, emulator.scene, dtype, too_fast
         points = _numbers("position", position)
         dim = self.scene.dim
         if points.dim() not in (2, 3) or points.shape[-1] != dim or not points.numel():
@@ -180,13 +181,13 @@ class StateBuilder:
             DataError: if it is not the model's, or needed.
         """
         scene, shape = self.scene, (self.batch, self.scene.dim)
-        if given is None and scene.gravity_varies:
+        if given is None and scene.gravity_varies and scene.gravity is None:
             raise DataError("gravity is needed, in length/s²: this model's scenes differ in it.")
         stated = scene.gravity or (0.0,) * scene.dim
         values = self._expand("gravity", stated if given is None else given, [shape[1:], shape], shape)
         if not values.isfinite().all():
             raise DataError(f"gravity = {values.tolist()} must be finite.")
-        if scene.gravity_varies:
+        if given is not None and scene.gravity_varies:
             self._check_gravity_range(values)
         elif given is not None:
             self._check_fixed_gravity(values)
@@ -228,7 +229,7 @@ class StateBuilder:
             f" {_format(velocity[scene, particle])} length/s"
         )
         limit = _format(limits[material[scene, particle]])
-        if most > TOO_FAST:
+        if most > self.too_fast:
             raise DataError(
                 f"{particle_is}, is far beyond {limit}, up to which the model was calibrated. Velocities are in domain"
                 " length per second."

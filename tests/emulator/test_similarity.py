@@ -10,8 +10,8 @@ from scenes import box, cloud, emulator_of
 from nmpm.emulator import rollout
 from nmpm.emulator.similarity import find_match
 from nmpm.errors import ConfigError
+from nmpm.motion import Motion
 from nmpm.processors import UNet
-from nmpm.scene import Motion
 
 
 def model_of(scene=None, cells=24, **statistics):
@@ -112,3 +112,116 @@ def test_without_gravity_speeds_decide():
     assert match.reading.every == 2
     assert not match.warnings
     assert "by speeds" in match.lines[2]
+
+
+def test_a_rougher_match_is_a_warning_with_its_factor_and_strictly_refused():
+    emulator = model_of()
+    scene = in_other_units(emulator.scene, gravity=(0.0, -0.8), boundary=("open", "wall"))
+    match = find_match(emulator, scene, stride=Fraction(1), names=("goop", "slime"))
+    gravity, boundary = match.warnings
+    assert "slime is 0.0" in gravity
+    assert "times that of goop" in gravity
+    assert boundary == "Along x slime has the boundary 'open', goop was trained with 'wall'."
+    with pytest.raises(ConfigError, match="times that of goop"):
+        find_match(emulator, scene, stride=Fraction(1), strict=True, names=("goop", "slime"))
+
+
+@pytest.mark.parametrize(
+    ("change", "motion", "warning"),
+    [
+        ({"gravity": None}, None, "Gravity of the data is not known"),
+        ({"gravity": (0.0, 0.0)}, None, "has no gravity, but the model learnt to fall"),
+        ({"gravity": None, "gravity_varies": True}, None, "Gravity differs between the scenes"),
+        ({"gravity": (0.0, 9.81 * 250 / 1600)}, None, "points along"),
+        ({"obstacles": True, "moving_obstacles": True}, None, "moving obstacles"),
+        ({}, Motion(1.0, 100.0), "times those that the model is calibrated for"),
+    ],
+    ids=["unknown", "none", "differing", "upwards", "moving", "fast"],
+)
+def test_warnings_name_what_differs(change, motion, warning):
+    emulator = model_of()
+    match = find_match(emulator, in_other_units(emulator.scene, **change), motion)
+    assert any(warning in each for each in match.warnings)
+    assert emulator.matched(match).recipe == match.recipe
+
+
+def test_gravity_that_is_not_stated_is_taken_as_measured():
+    emulator = model_of()
+    scene = in_other_units(emulator.scene)
+    match = find_match(emulator, dataclasses.replace(scene, gravity=None), Motion(1.0, 2.0, gravity=scene.gravity))
+    assert match.recipe.scene.gravity == scene.gravity
+    assert "as measured" in match.lines[2]
+    assert not match.warnings
+
+
+def test_walls_begin_with_the_models_share_of_a_cell_and_cells_are_whole():
+    emulator = model_of(box(bounds=((0.1, 0.9), (0.1, 0.9)), domain=((0.09, 0.93), (0.09, 0.93))))
+    scene = in_other_units(emulator.scene, bounds=((0.0, 317.0), (-4.0, 90.0)), domain=((-9.0, 320.0), (-9.0, 99.0)))
+    recipe = find_match(emulator, scene).recipe
+    (low, high), (first, last), h = recipe.scene.bounds[0], recipe.scene.domain[0], recipe.grid.spacing[0]
+    assert (low - first) / h == pytest.approx(0.01 / emulator.grid.spacing[0])
+    assert (last - high) / h >= 0.03 / emulator.grid.spacing[0] - 1e-3
+    assert recipe.grid.spacing[1] == pytest.approx(h)
+    assert h == pytest.approx(250 * emulator.grid.spacing[0], rel=0.05)
+
+
+def test_periods_are_whole_cells_of_a_number_that_the_network_takes():
+    emulator = model_of(box(boundary=("periodic", "wall"), domain=((0.1, 0.9), (0.08, 0.92))), cells=(16, 24))
+    scene = in_other_units(emulator.scene, bounds=((0.0, 230.0), (0.0, 77.0)), domain=((0.0, 230.0), (-5.0, 80.0)))
+    match = find_match(emulator, scene)
+    assert match.recipe.cells[0] % 2 == 0
+    assert match.recipe.scene.domain[0] == (0.0, 230.0)
+
+
+def test_cells_keep_the_ratio_of_their_sides():
+    emulator = model_of(cells=(24, 20))
+    recipe = find_match(emulator, in_other_units(emulator.scene)).recipe
+    assert recipe.cells == (24, 20)
+
+
+def test_a_model_that_is_told_gravity_takes_any_up_to_its_own():
+    emulator = model_of(box(gravity=None, gravity_varies=True))
+    strongest = 9.81 * 0.0025**2 / emulator.grid.spacing[0]
+    emulator.input_std[-2:] = strongest / 2
+    emulator.input_low[-2:], emulator.input_high[-2:] = -2 * strongest, 2 * strongest
+    sideways = in_other_units(box(), gravity=(0.8 * 9.81 * 250 / 1600, 0.0))
+    match = find_match(emulator, sideways)
+    assert not match.warnings
+    assert match.recipe.scene.gravity_varies
+    assert match.recipe.scene.gravity == sideways.gravity
+    assert match.recipe.grid.spacing[0] == pytest.approx(250 * emulator.grid.spacing[0], rel=0.05)
+
+
+def test_a_model_of_many_particle_sizes_takes_them_all():
+    recipe = dataclasses.replace(model_of().recipe, particles_per_cell=(1.0, 9.0))
+    assert type(recipe).from_dict(recipe.to_dict()) == recipe
+    emulator = model_of()
+    emulator.recipe = recipe
+    for spacings in (1.1, 2.9):
+        width = 250 * emulator.grid.spacing[0]
+        match = find_match(emulator, in_other_units(emulator.scene, particle_volume=(width / spacings) ** 2))
+        assert not match.warnings
+        assert float(match.lines[2].split()[-1]) == pytest.approx(1, abs=0.05)
+    with pytest.raises(ConfigError, match="the fewest, then the most"):
+        dataclasses.replace(recipe, particles_per_cell=(9.0, 1.0))
+
+
+def test_obstacles_and_walls_keep_or_add_the_solid_channel():
+    walled, bare = model_of(), model_of(box(domain=((0.1, 0.9), (0.1, 0.9))))
+    open_sky = in_other_units(walled.scene, boundary=("open", "open"))
+    assert find_match(walled, open_sky).recipe.scene.input_channels == walled.scene.input_channels
+    rocks = find_match(bare, in_other_units(bare.scene, obstacles=True))
+    assert "solid" in rocks.recipe.scene.input_channels
+    assert "does not see" in rocks.warnings[0]
+    assert bare.matched(rocks).input_mean.shape[0] == bare.input_mean.shape[0] + 1
+
+
+def test_what_cannot_be_is_refused():
+    emulator = model_of()
+    with pytest.raises(ConfigError, match="2 axes"):
+        find_match(emulator, box(3))
+    with pytest.raises(ConfigError, match="stride = 2/3"):
+        find_match(emulator, box(), stride=Fraction(2, 3))
+    vast = in_other_units(emulator.scene, bounds=((0.0, 1e6), (0.0, 1e6)), domain=((-9.0, 1.1e6), (-9.0, 1.1e6)))
+    with pytest.raises(ConfigError, match=r"more than 4,000,000.*wide for particles"):
+        find_match(emulator, vast)

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 import torch
 
+from nmpm import TrajectoryDataModule, load_trajectories
 from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import ConfigError, DataError
 from nmpm.processors import UNet
@@ -54,6 +55,31 @@ def test_scenes_unlike_the_models_are_taken_with_a_warning_or_refused(model):
         assert model.over(sideways).scene == sideways
     with pytest.raises(ConfigError, match="turn the data"):
         model.fit_to(sideways, strict=True)
+
+
+@pytest.mark.parametrize("kind", ["folder", "dataset", "datamodule"])
+def test_data_of_any_kind_are_fitted_to_with_their_speeds(model, make_dataset, kind):
+    folder = make_dataset(particle_types={3: "boundary", 7: "Jelly"})
+    data = {"folder": str, "dataset": load_trajectories, "datamodule": lambda path: TrajectoryDataModule(str(path))}
+    fitted = model.fit_to(data[kind](folder))
+    assert fitted.match.reading.materials == {"Jelly": "goop"}
+    assert "unknown" not in fitted.match.lines[3].partition(";")[2].partition("(")[0]
+    state = fitted.start(load_trajectories(folder).test[0])
+    assert fitted.rollout(state, 4).isfinite().all()
+
+
+def test_a_stride_may_be_text(model):
+    slow = dataclasses.replace(model.scene, dt=0.005)
+    assert model.fit_to(slow, stride="1/2").match.reading.between == 2
+    with pytest.raises(ConfigError, match="stride = 'often'"):
+        model.fit_to(slow, stride="often")
+
+
+def test_states_of_a_model_that_is_told_gravity_fall_as_the_data_state(turned):
+    fitted = turned.fit_to(dataclasses.replace(turned.scene, gravity=(0.0, -9.0), gravity_varies=False))
+    state = fitted.state([[0.5, 0.5]])
+    assert state.gravity.tolist()[0] == pytest.approx([0.0, -9.0 * 0.0025**2])
+    assert fitted.example(count=30).gravity.tolist()[0] == pytest.approx([0.0, -9.0 * 0.0025**2])
 
 
 def test_a_model_prints_as_one_line_and_loading_leaves_torchs_random_state_as_it_is(model, root):
