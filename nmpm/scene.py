@@ -265,6 +265,22 @@ class Reading:
         return (frames - 1) // self.every + 1 if self.between == 1 else 2 + self.between * (frames - 2)
 
 
+@dataclass(frozen=True)
+class Motion:
+    """How a dataset's particles move, as measured in some of its trajectories.
+
+    Args:
+        rms: Root mean square of their speeds, in length per frame of the dataset.
+        largest: Speed that all but the fastest 0.1% stay below, likewise.
+        gravity: In length per second squared; measured where the scene states none, and where it varies each
+            component's root mean square. None where it is unknown.
+    """
+
+    rms: float
+    largest: float
+    gravity: tuple[float, ...] | None = None
+
+
 def check_field_names(names: Iterable[str]) -> None:
     """Raise ConfigError unless names of fields can name channels.
 

@@ -10,7 +10,7 @@ from nmpm.data.facts import find_facts
 from nmpm.data.format import SPLITS, Metadata, Split, find_split
 from nmpm.data.gravity import Gravity, trajectory_gravity
 from nmpm.data.statistics import displacements
-from nmpm.motion import Motion
+from nmpm.scene import Motion
 
 _TRAJECTORIES, _PAIRS = 8, 12
 _QUANTILE = 0.999

@@ -11,8 +11,7 @@ import torch
 
 from nmpm.emulator.calibration import channel_values
 from nmpm.emulator.model import UNLIMITED, Emulator
-from nmpm.motion import Motion
-from nmpm.scene import Interval, Scene
+from nmpm.scene import Interval, Motion, Scene
 
 _SPACING = 1.5
 """Factor by which the spacing of particles may differ from the training's where the recipe states no range."""

@@ -10,8 +10,8 @@ from scenes import box, cloud, emulator_of
 from nmpm.emulator import rollout
 from nmpm.emulator.similarity import find_match
 from nmpm.errors import ConfigError
-from nmpm.motion import Motion
 from nmpm.processors import UNet
+from nmpm.scene import Motion
 
 
 def model_of(scene=None, cells=24, **statistics):
