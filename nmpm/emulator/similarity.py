@@ -139,8 +139,10 @@ class _Search:
         except ConfigError:
             return None
         figures = Figures.of(self.scene, self.motion, recipe.grid.spacing, Fraction(1))
-        unseen = recipe.scene.gravity_varies and not math.isclose(self.seen.motion_factor(figures), 1.0)
-        return None if unseen else (recipe, Fraction(1))
+        (fewest, most), seen = self.seen.spacings, math.isclose(self.seen.motion_factor(figures), 1.0)
+        if recipe.scene.gravity_varies and not (seen and fewest <= figures.spacing <= most):
+            return None
+        return recipe, Fraction(1)
 
     def best(self, strides: Sequence[Fraction], names: tuple[str, str]) -> tuple[EmulatorRecipe, Fraction]:
         """The form of the model, and the stride, of the least cost.

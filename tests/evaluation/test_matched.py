@@ -10,9 +10,11 @@ from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.evaluation.comparison import free_fall
 from nmpm.evaluation.matched import MatchedPredictor
+from nmpm.evaluation.trade.fitted import fit_to_scenes
 from nmpm.particles import Window
 from nmpm.processors import Identity
 from nmpm.scene import Reading, Scene
+from tests.evaluation.trade.made_up import tiny_emulator, tiny_scenes
 
 DATA = Scene(
     bounds=((0.0, 100.0),) * 2,
@@ -48,6 +50,18 @@ def thrown(frames: int, gravity=DATA.gravity) -> Window:
         obstacle_mask=torch.zeros(1, 0, dtype=torch.bool),
         gravity=pull[None],
     )
+
+
+def test_a_model_of_more_materials_predicts_scenes_of_one_as_that_one(tmp_path):
+    """The index of a material among the model's is not that among the data's."""
+    scenes = tiny_scenes(tmp_path)
+    wide = dataclasses.replace(scenes.scene, materials=("water", "goop"))
+    fitted = fit_to_scenes("wide", tiny_emulator(wide), scenes)
+    window = scenes.window([0])
+    state = MatchedPredictor(fitted.emulator, fitted.reading, scenes.scene).state(window.initial)
+    assert window.material.unique().tolist() == [0]
+    assert state.material.unique().tolist() == [1]
+    torch.testing.assert_close(state.velocity, window.initial.velocity)
 
 
 @pytest.mark.parametrize(("every", "between"), [(1, 1), (1, 2), (1, 5), (2, 1), (3, 1)])

@@ -55,7 +55,7 @@ def fit_to_scenes(name: str, emulator: Emulator, scenes: Scenes, find: MatchFind
         match = find(emulator, scenes.scene, scenes.motion, names=(name, scenes.name))
     except ConfigError as error:
         raise ConfigError(f"The model {name} cannot predict the scenes of {scenes.name}. {error}") from error
-    if is_plain(match.reading):
+    if is_plain(match.reading) and match.reading.scene.materials == scenes.scene.materials:
         return FittedModel(name, weights, emulator.matched(match), ", ".join(differing))
     for warning in match.warnings:
         warnings.warn(warning, stacklevel=3)
