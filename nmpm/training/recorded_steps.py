@@ -101,12 +101,14 @@ class _RecordedStep:
         self._weights = [weight for weight in emulator.parameters() if weight.requires_grad]
         batch, start, placed = _arguments(emulator, window, self._inputs)
 
+        device = emulator.device
+
         def compute() -> tuple[Tensor, Sequence[Tensor | None]]:
             with _fresh_casts(), torch.enable_grad():
                 mean = error(placed, start(), batch)
-                return mean.detach(), torch.autograd.grad(mean, self._weights, allow_unused=True)
+                with torch.autocast(device.type, enabled=False):
+                    return mean.detach(), torch.autograd.grad(mean, self._weights, allow_unused=True)
 
-        device = emulator.device
         with torch.random.fork_rng([device] if device.type == "cuda" else []):  # a first replay draws what others do
             self._replay, (self._mean, self._gradients) = cuda_graph.record(compute, device, pool)
 
