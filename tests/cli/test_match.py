@@ -12,6 +12,7 @@ import yaml
 
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
+from nmpm.cli.emulator_cli import EmulatorCLI
 from nmpm.data.format import Split, read_metadata, write_metadata, write_split
 from nmpm.zoo import Zoo
 from tests.made_up import made_up_metadata, made_up_trajectory
@@ -33,7 +34,7 @@ def write_foreign(frames: int = 32, every: int = 1, **changes) -> Path:
         position = 1000 * run.position[::every] + 250
         write_split(Path("grains", f"{name}.h5"), [run.__class__(position, run.particle_type, run.attributes)] * 2)
     units = {"bounds": ((350.0, 1150.0),) * 2, "dt": 2.5 * every, "gravity": (0.0, -9.81e-3)}
-    names = {"particle_types": {3: "floor", 7: "steel"}, "particle_volume": 40.0}
+    names = {"particle_types": {3: "floor", 7: "steel"}, "particle_volume": 51.0}
     write_metadata(Path("grains"), made_up_metadata(**(units | names | changes)))
     return Path("grains")
 
@@ -148,13 +149,16 @@ def test_a_run_is_tested_on_data_of_another_kind(capsys, make_dataset):
     assert errors[1] > 1e4 * errors[0]  # in mm²
 
 
-def test_a_configuration_s_form_is_left_out_with_a_line(capsys):
-    data = write_foreign()
-    words = ["fit", "--config", "tutorial.yaml", "--start_from", "goop", "--data.path", str(data), *TINY]
-    assert main([*words, "--model.cells", "16", "--trainer.default_root_dir", "run"]) == 0
-    assert "Left out of the configuration, as goop has its own: model.cells" in capsys.readouterr().out
-    cells = yaml.safe_load(Path("run/config.yaml").read_text())["model"]["cells"]
-    assert cells == list(Zoo.load("goop").emulator.recipe.cells)
+def test_a_configuration_s_form_is_left_out_with_a_line(monkeypatch):
+    built = []
+    monkeypatch.setattr(EmulatorCLI, "_run_subcommand", lambda cli, _: built.append(cli))
+    words = ["fit", "--config", "tutorial.yaml", "--start_from", "multimaterial", "--data.path", str(write_foreign())]
+    assert main([*words, *TINY, "--model.frames", "16", "--materials", "steel=sand", "--stride", "1/16"]) == 0
+    (cli,), recipe = built, Zoo.load("multimaterial").emulator.recipe
+    assert "Left out of the configuration, as multimaterial has its own: model.cells, model.frames" in str(cli.matched)
+    assert cli.model.emulator.recipe.processor == recipe.processor
+    assert cli.model.emulator.scene.materials == recipe.scene.materials
+    assert cli.model.unroll * recipe.frames == cli.datamodule.horizon >= 16  # to the next frame of the data
 
 
 def test_models_are_compared_on_data_of_another_kind(capsys, monkeypatch):

@@ -9,8 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from lightning.pytorch.utilities import rank_zero_info
-
 from nmpm.data.convert import Options, native_folder
 from nmpm.data.format import Metadata, Split, find_split, is_native, read_metadata, split_renames
 from nmpm.data.hub import hub_folder
@@ -151,6 +149,8 @@ def hold_out(source: DataSource) -> DataSource:
     Raises:
         DataError: if its folder has that split under another name.
     """
+    from lightning.pytorch.utilities import rank_zero_info  # imported late: only trainings need it
+
     if isinstance(source, HoldOut):
         return source
     if split_renames(source.folder, ("valid",)):
