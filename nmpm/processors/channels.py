@@ -78,10 +78,10 @@ class ChannelChange:
         cells = self.layers.cells
         for channel, source in enumerate(self.outputs):
             for cell in range(cells):
-                own = f"{prefix}{source.channel * cells + cell}."
-                names = [name for name in before if name.startswith(own)]
+                network = f"{prefix}{source.channel * cells + cell}."
+                names = [name for name in before if name.startswith(network)]
                 writer, _ = names[-1].rsplit(".", 1)
                 for name in names:
                     is_zero = source.zero and name.startswith(f"{writer}.")
-                    new = f"{prefix}{channel * cells + cell}.{name.removeprefix(own)}"
+                    new = f"{prefix}{channel * cells + cell}.{name.removeprefix(network)}"
                     yield new, torch.zeros_like(before[name]) if is_zero else before[name]
