@@ -16,6 +16,7 @@ from nmpm.scene import Interval, Motion, Scene
 _SPACING = 1.5
 """Factor by which the spacing of particles may differ from the training's where the recipe states no range."""
 _SPACING_WEIGHT = 0.05
+"""Weight of the particles' spacing beside gravity, within a range that the recipe states; outside it is 1."""
 _WEAK = 0.5
 """A model that is told gravity is matched to this share of its root mean square, or more."""
 
@@ -86,7 +87,7 @@ class Experience:
 
     @property
     def spacing_weight(self) -> float:
-        """Weight of the squared logarithm of the spacing over the training's, beside `motion_weight`."""
+        """Weight of the spacing's factor over the training's beside that of gravity."""
         return _SPACING_WEIGHT if self.varied_spacing else 1.0
 
     def motion_factor(self, data: Figures) -> float:
@@ -98,14 +99,6 @@ class Experience:
     def speed_excess(self, data: Figures) -> float:
         """The data's largest speed over that up to which the model is calibrated; 0 where either is unknown."""
         return data.largest / self.fastest if data.largest and self.fastest else 0.0
-
-
-def motion_weight(factor: float) -> float:
-    """Weight of the squared logarithm of gravity's or speeds' factor.
-
-    Too strong gravity is the smaller evil: flight is exact, and what moves too little per frame comes to rest early.
-    """
-    return 0.5 if factor > 1 else 1.0
 
 
 def clamp(value: float, low: float, high: float) -> float:

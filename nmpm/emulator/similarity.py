@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from nmpm.emulator.experience import Experience, Figures, clamp, mean_width, motion_weight
+from nmpm.emulator.experience import Experience, Figures, clamp, mean_width
 from nmpm.emulator.match_report import MatchReport
 from nmpm.emulator.material_names import match_materials
 from nmpm.emulator.model import Emulator
@@ -28,8 +28,8 @@ STRIDES = tuple(Fraction(k) for k in _WHOLE) + tuple(Fraction(1, k) for k in _WH
 """Frames of the data for one of the model that are tried."""
 _SHIFTS = tuple(1 + 0.002 * i for i in sorted(range(-20, 21), key=abs))
 """Factors on the best size of cells that are tried, for walls as in the model's scenes."""
-_SPEED_COST, _STRIDE_COST, _WALL_COST = 0.25, 0.01, 0.01
-"""Weights of the squared logarithms of speeds beyond the model's and of strides, and of misfits of walls."""
+_SPEED_COST, _STRIDE_COST, _BETWEEN_COST, _WALL_COST = 0.5, 0.01, 0.04, 0.01
+"""Weights of speeds beyond the model's, of the squared logarithms of strides k and 1/k, and of misfits of walls."""
 _SAME_UNITS = 4.0
 """Factor between the distances of particles of scenes that may be in the same unit of length."""
 _MOST_CELLS = 4_000_000
@@ -166,23 +166,20 @@ class _Search:
         """Length of the data for one of the model: of the least cost, if cells had no walls to fit.
 
         At the model's spacing of particles, gravity or speeds are a factor too large. Where cells are wider by x, they
-        are a factor / x: w log²(factor / x) + w' log² x is least at x = factor ** (w / (w + w')).
+        are a factor / x: log²(factor / x) + w log² x is least at x = factor ** (1 / (1 + w)).
         """
         at_one = Figures.of(self.scene, self.motion, self.emulator.grid.spacing, stride)
         usual = at_one.scaled(self.seen.spacing / at_one.spacing)
-        factor = self.seen.motion_factor(usual)
-        weight, spacing_weight = motion_weight(factor), self.seen.spacing_weight
-        spacing = usual.spacing * factor ** (weight / (weight + spacing_weight))
-        return clamp(spacing, *self.seen.spacings) / at_one.spacing
+        wider = self.seen.motion_factor(usual) ** (1 / (1 + self.seen.spacing_weight))
+        return clamp(usual.spacing * wider, *self.seen.spacings) / at_one.spacing
 
     def _cost(self, stride: Fraction, grid: SimilarGrid) -> float:
         figures = Figures.of(self.scene, self.motion, grid.widths, stride)
-        factor = self.seen.motion_factor(figures)
         return (
-            motion_weight(factor) * math.log(factor) ** 2
-            + self.seen.spacing_weight * math.log(figures.spacing / self.seen.spacing) ** 2
-            + _SPEED_COST * math.log(max(1.0, self.seen.speed_excess(figures))) ** 2
-            + _STRIDE_COST * math.log(stride) ** 2
+            _deviation(self.seen.motion_factor(figures))
+            + self.seen.spacing_weight * _deviation(figures.spacing / self.seen.spacing)
+            + _SPEED_COST * _deviation(max(1.0, self.seen.speed_excess(figures)))
+            + (_STRIDE_COST if stride > 1 else _BETWEEN_COST) * math.log(stride) ** 2
             + _WALL_COST * grid.misfit
         )
 
@@ -195,3 +192,12 @@ class _Search:
         conserved = recipe.constraints.energy and scene.gravity_known and scene.is_closed
         constraints = dataclasses.replace(recipe.constraints, energy=conserved)
         return dataclasses.replace(recipe, scene=scene, cells=grid.cells, constraints=constraints)
+
+
+def _deviation(factor: float) -> float:
+    """The squared logarithm of gravity, speeds or particles over the model's, half of it where they are too many.
+
+    Too much is the smaller evil: flight is exact and many particles average well, but what moves too little per frame
+    comes to rest early, and few particles leave holes.
+    """
+    return (0.5 if factor > 1 else 1.0) * math.log(factor) ** 2

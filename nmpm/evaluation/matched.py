@@ -106,7 +106,7 @@ class MatchedPredictor:
 
     def state(self, particles: Particles) -> Particles:
         """A state of the dataset in the model's materials, with velocity and gravity per frame of the model."""
-        ratio, gravity = self.reading.every / self.reading.between, particles.gravity
+        ratio, gravity = self.reading.every / self.reading.between, self._gravity(particles)
         unknown = torch.full_like(particles.velocity, torch.nan)
         velocity = model_velocity(particles.velocity, unknown, gravity.unsqueeze(1), ratio)
         index = torch.tensor(material_indices(self.scene, self.reading)).to(gravity.device)
@@ -118,6 +118,13 @@ class MatchedPredictor:
             material=index[particles.material],
             obstacle_velocity=None if last is None else last * ratio,
         )
+
+    def _gravity(self, particles: Particles) -> Tensor:
+        """(B, D) gravity of a state in length per frame of the dataset²; the reading's where it states none."""
+        measured = self.reading.scene.gravity
+        if self.scene.gravity_known or measured is None:
+            return particles.gravity
+        return (particles.gravity.new_tensor(measured) * self.scene.dt**2).expand_as(particles.gravity)
 
     def _obstacle_path(self, frames: Tensor) -> Tensor:
         """Positions (B, F', M, D) of obstacles at the model's frames, of (B, F, M, D) at the dataset's."""

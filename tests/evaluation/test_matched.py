@@ -110,3 +110,11 @@ def test_obstacles_move_at_the_model_s_frames():
         path = predictor_of(every, between, **scene)._obstacle_path(moved[:, 1:])
         assert path[0, 1, 0].tolist() == [50.0 + every / between, 50.0]
         assert predictor_of(every, between, **scene).predict(window).shape == window.target.shape
+
+
+def test_gravity_that_the_dataset_does_not_state_is_the_readings():
+    window = thrown(12)
+    predictor = predictor_of(1, 2)
+    unstated = dataclasses.replace(predictor, scene=dataclasses.replace(DATA, gravity=None))
+    silent = dataclasses.replace(window, gravity=torch.zeros_like(window.gravity))
+    torch.testing.assert_close(unstated.predict(silent), predictor.predict(window), rtol=0, atol=1e-5)

@@ -55,7 +55,8 @@ def fit_to_scenes(name: str, emulator: Emulator, scenes: Scenes, find: MatchFind
         match = find(emulator, scenes.scene, scenes.motion, names=(name, scenes.name))
     except ConfigError as error:
         raise ConfigError(f"The model {name} cannot predict the scenes of {scenes.name}. {error}") from error
-    if is_plain(match.reading) and match.reading.scene.materials == scenes.scene.materials:
+    ours, theirs = match.reading.scene, scenes.scene
+    if is_plain(match.reading) and (ours.materials, ours.gravity_known) == (theirs.materials, theirs.gravity_known):
         return FittedModel(name, weights, emulator.matched(match), ", ".join(differing))
     for warning in match.warnings:
         warnings.warn(warning, stacklevel=3)
