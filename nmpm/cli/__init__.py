@@ -22,7 +22,7 @@ COMMANDS = {
     "convert": ("nmpm.cli.convert", "Convert a dataset of another format to the native layout."),
     "init": ("nmpm.cli.init", "Write a configuration for a dataset, chosen by what its trajectories show."),
     "inspect": ("nmpm.cli.inspect", "Summarise a dataset on one screen, with anything odd about it."),
-    "zoo": ("nmpm.cli.zoo", "List the pretrained models, show a card, or add a finished run."),
+    "zoo": ("nmpm.cli.zoo", "List the pretrained models, find one for your data, or add a finished run."),
     "rollout": ("nmpm.cli.rollout", "Roll a pretrained model out and write the trajectories."),
     "stress": ("nmpm.cli.stress", "Test a model at the extremes: pass or fail, with measured margins."),
     "compare": ("nmpm.cli.compare", "Compare models on scenes that need not be their own."),
@@ -46,6 +46,7 @@ first steps:
   nmpm inspect FOLDER                          summarise recorded data of any format known
   nmpm init FOLDER                             write a configuration for it: FOLDER.yaml
   nmpm fit --config FOLDER.yaml                train on it; or at once: nmpm fit --data.path FOLDER
+  nmpm zoo match FOLDER                        which pretrained model predicts it, or to start from
   nmpm rollout goop --frames 400 --out out.h5  roll a pretrained model out
   nmpm render out.h5                           draw the rollout
   nmpm view out.h5                             play it in a browser

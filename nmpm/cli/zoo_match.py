@@ -26,6 +26,10 @@ examples:
 """
 
 
+_WORDS = ("gravity", "speeds", "particles to a cell", "boundary", "obstacles")
+"""Of warnings, in short."""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("data", type=Path, help="a dataset, of any format that nmpm convert reads")
@@ -41,37 +45,57 @@ def match(options: argparse.Namespace) -> None:
     from nmpm._support.progress import progress_bar
     from nmpm.data.dataset import Dataset
     from nmpm.data.loading.sources import FolderSource
-    from nmpm.zoo.ranking import Trial, rank_models
+    from nmpm.zoo.ranking import Ranking, Trial
     from nmpm.zoo.registry import Zoo, load_model
 
     trial = Trial.of(Dataset(FolderSource(options.data)))
     names = Zoo.list(options.root)
     loaders = {name: (lambda name=name: load_model(name, root=options.root).emulator) for name in names}
     with progress_bar("models", len(names)) as step:
-        standings = rank_models(trial, loaders, stated.materials, stated.stride, step)
+        standings = Ranking(trial, stated.materials, stated.stride).rank(loaders, step)
     Console().print(_table(trial, standings))
     best = next((one for one in standings if one.match is not None and math.isfinite(one.error)), None)
     sys.stdout.write("".join(f"{line}\n" for line in _advice(options, trial, best)))
 
 
 def _table(trial: Trial, standings: Sequence[Standing]) -> Table:
+    from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
     table = Table(
         title=f"{trial.name}: errors at {trial.frames} frames over that of the better trivial predictor",
         title_justify="left",
+        box=SIMPLE_HEAD,
+        padding=0,
+        collapse_padding=True,
     )
-    table.add_column("model")
-    for heading in ("error", "cells"):
-        table.add_column(heading, justify="right")
-    table.add_column("how it takes the data")
+    table.add_column("model", no_wrap=True)
+    for heading in ("error", "cells", "stride", "gravity"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for heading in ("materials", "not matched"):
+        table.add_column(heading)
     for one in standings:
-        cells = "" if one.match is None else "×".join(map(str, one.match.recipe.grid.shape))
-        how = [one.how, *(f"{name} as {theirs}" for name, theirs in (one.materials or {}).items())]
-        table.add_row(one.model, f"{one.error:.2g}" if math.isfinite(one.error) else "", cells, ", ".join(how))
+        table.add_row(*_row(one))
     for name, error in (("nothing moves", trial.still), ("free fall", trial.free_fall)):
         table.add_row(name, f"{error / trial.trivial:.2g}")
     return table
+
+
+def _row(one: Standing) -> list[str]:
+    error = f"{one.error:.2g}" if math.isfinite(one.error) else ""
+    if one.match is None:
+        return [one.model, error, "", "", "", "", one.failure]
+    reading, recipe = one.match.reading, one.match.recipe
+    unmatched = [word for word in _WORDS if any(word in warning.lower() for warning in one.match.warnings)]
+    return [
+        one.model,
+        error,
+        "×".join(map(str, recipe.grid.shape)),
+        str(reading.every) if reading.between == 1 else f"1/{reading.between}",
+        "" if one.gravity is None else f"× {one.gravity:.3g}",
+        ", ".join(f"{name}={theirs}" for name, theirs in (one.stated or {}).items()),
+        ", ".join([*unmatched, *([one.failure] if one.failure else [])]),
+    ]
 
 
 def _advice(options: argparse.Namespace, trial: Trial, best: Standing | None) -> list[str]:
@@ -82,10 +106,10 @@ def _advice(options: argparse.Namespace, trial: Trial, best: Standing | None) ->
     if best.error >= 1:
         lines.append("No model is better than a trivial predictor; a fine-tuning may be.")
     materials = {name: best.match.reading.materials.get(name, name) for name in trial.scene.materials}
-    renamed = [f"--materials={','.join(f'{name}={theirs}' for name, theirs in materials.items() if name != theirs)}"]
+    renamed = ["--materials", ",".join(f"{name}={theirs}" for name, theirs in materials.items() if name != theirs)]
     stated = [
         *(renamed if best.match.reading.materials else []),
-        *([f"--stride={options.stride}"] if options.stride else []),
+        *(["--stride", options.stride] if options.stride else []),
     ]
     data = str(options.data)
     rollout, fit = ["rollout", best.model, "--data", data], ["fit", "--start_from", best.model, "--data.path", data]

@@ -35,9 +35,15 @@ def is_plain(reading: Reading) -> bool:
 
 def describe_match(emulator: Emulator, match: Match) -> str:
     """How a model takes scenes of another kind, in a phrase: "4 frames for 1 of the data, gravity × 1.02"."""
+    factor = gravity_factor(emulator, match)
+    gravity = "" if factor is None else f", gravity × {factor:.3g}"
+    return f"{counted(match.reading.between, 'frame')} for {match.reading.every} of the data{gravity}"
+
+
+def gravity_factor(emulator: Emulator, match: Match) -> float | None:
+    """Gravity of the data over the model's, in cells per frame²; None where one has none, or several."""
     ours, theirs = gravity_in_cells(emulator.recipe), gravity_in_cells(match.recipe)
-    factor = f", gravity × {theirs / ours:.3g}" if ours and theirs else ""
-    return f"{counted(match.reading.between, 'frame')} for {match.reading.every} of the data{factor}"
+    return theirs / ours if ours and theirs else None
 
 
 def gravity_in_cells(recipe: EmulatorRecipe) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
@@ -22,7 +22,7 @@ from nmpm.emulator.prescribed import predict_from_entries, with_predicted
 from nmpm.emulator.similarity import Match, find_match
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.comparison import free_fall, still
-from nmpm.evaluation.matched import MatchedPredictor, describe_match
+from nmpm.evaluation.matched import MatchedPredictor, gravity_factor
 from nmpm.particles import Window
 from nmpm.scene import Motion, Scene
 
@@ -112,74 +112,80 @@ class Standing:
         model: Its name.
         error: Mean squared error over that of the better trivial predictor; infinite where it fails.
         match: How it takes the data; None where it cannot.
-        how: The match in a phrase, or why there is none.
-        emulator: The model, on its own grid.
-        materials: Those that are to be stated for this match; empty where they are proposed.
+        gravity: Factor of the data's over the model's, in cells per frame²; None where either has none.
+        failure: Why there is no error; else empty.
+        stated: The model's material by the data's name, where the names do not tell.
     """
 
     model: str
     error: float = math.inf
     match: Match | None = None
-    how: str = ""
-    materials: Mapping[str, str] | None = None
+    gravity: float | None = None
+    failure: str = ""
+    stated: Mapping[str, str] | None = None
 
 
-def rank_models(
-    trial: Trial,
-    models: Mapping[str, Callable[[], Emulator]],
-    materials: Mapping[str, str] | None = None,
-    stride: Fraction | None = None,
-    step: Callable[[str], object] = lambda _: None,
-) -> list[Standing]:
-    """The standings of models that load, the best first; of models of other dimensions none.
+@dataclass(frozen=True)
+class Ranking:
+    """Tries models on a dataset.
 
     Args:
         trial: Of the data.
-        models: By name, what loads each.
-        materials: As for `find_match`, and so is the next.
-        stride: Frames of the data for one of the model.
-        step: Called with each model's name.
+        materials: The model's material by the data's name, of models that have those; see `find_match`.
+        stride: Frames of the data for one of the model; the best one if None.
     """
-    standings = []
-    for name, load in models.items():
+
+    trial: Trial
+    materials: Mapping[str, str] | None = None
+    stride: Fraction | None = None
+
+    def rank(self, models: Mapping[str, Callable[[], Emulator]], step: Callable[[str], object]) -> list[Standing]:
+        """The standings of models by what loads them, the best first; none of models of another dimension.
+
+        `step` is called with each model's name.
+        """
+        standings = []
+        for name, load in models.items():
+            try:
+                emulator = load()
+                if emulator.scene.dim == self.trial.scene.dim:
+                    standings.append(self._best(name, emulator))
+            except NmpmError as error:
+                standings.append(Standing(name, failure=one_line(error)))
+            step(name)
+        return sorted(standings, key=lambda one: one.error)
+
+    def _best(self, name: str, emulator: Emulator) -> Standing:
+        """With the materials that are stated or told by their names; else with the best that a few trials find."""
+        theirs = emulator.scene.materials
+        if self.materials is not None and set(self.materials.values()) <= set(theirs):
+            return self._try(name, emulator, self.materials)
         try:
-            emulator = load()
+            find_match(emulator, self.trial.scene, self.trial.motion)
+        except ConfigError:
+            return self._best_materials(name, emulator)
+        return self._try(name, emulator, None)
+
+    def _best_materials(self, name: str, emulator: Emulator) -> Standing:
+        """Everything as one of the model's materials, then each of the data's as another, where that is better."""
+        names, theirs = self.trial.scene.materials, emulator.scene.materials
+        tried = [self._try(name, emulator, dict.fromkeys(names, to)) for to in theirs]
+        for changed in names if len(names) > 1 else ():
+            best = min(tried, key=lambda one: one.error).stated or {}
+            others = [to for to in theirs if to != best[changed]]
+            tried += [self._try(name, emulator, {**best, changed: to}) for to in others]
+        return min(tried, key=lambda one: one.error)
+
+    def _try(self, name: str, emulator: Emulator, materials: Mapping[str, str] | None) -> Standing:
+        trial = self.trial
+        try:
+            names = (name, trial.name)
+            match = find_match(emulator, trial.scene, trial.motion, materials, self.stride, names=names)
+            predictor = MatchedPredictor(emulator.matched(match), match.reading, trial.scene)
+            with torch.inference_mode():
+                predicted = predictor.predict(trial.window)
         except NmpmError as error:
-            standings.append(Standing(name, how=one_line(error)))
-            continue
-        if emulator.scene.dim == trial.scene.dim:
-            tried = [_try(name, emulator, trial, renamed, stride) for renamed in _mappings(emulator, trial, materials)]
-            standings.append(min(tried, key=lambda one: one.error))
-        step(name)
-    return sorted(standings, key=lambda one: one.error)
-
-
-def _mappings(
-    emulator: Emulator, trial: Trial, materials: Mapping[str, str] | None
-) -> Iterator[Mapping[str, str] | None]:
-    """The materials that are stated, or else proposed; or else everything as each of the model's in turn."""
-    theirs = emulator.scene.materials
-    if materials is not None and set(materials.values()) <= set(theirs):
-        yield materials
-        return
-    try:
-        find_match(emulator, trial.scene, trial.motion)
-    except ConfigError:
-        yield from (dict.fromkeys(trial.scene.materials, name) for name in theirs)
-    else:
-        yield None
-
-
-def _try(
-    name: str, emulator: Emulator, trial: Trial, materials: Mapping[str, str] | None, stride: Fraction | None
-) -> Standing:
-    try:
-        match = find_match(emulator, trial.scene, trial.motion, materials, stride, names=(name, trial.name))
-        predictor = MatchedPredictor(emulator.matched(match), match.reading, trial.scene)
-        with torch.inference_mode():
-            predicted = predictor.predict(trial.window)
-    except NmpmError as error:
-        return Standing(name, how=one_line(error), materials=materials)
-    mean = mean_squared_error(predicted, with_predicted(trial.window, predictor.bundle))
-    relative = mean / trial.trivial if math.isfinite(mean) else math.inf
-    return Standing(name, relative, match, describe_match(emulator, match), materials)
+            return Standing(name, failure=one_line(error), stated=materials)
+        mean = mean_squared_error(predicted, with_predicted(trial.window, predictor.bundle))
+        relative, failure = (mean / trial.trivial, "") if math.isfinite(mean) else (math.inf, "not finite")
+        return Standing(name, relative, match, gravity_factor(emulator, match), failure, materials)

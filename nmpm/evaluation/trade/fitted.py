@@ -60,4 +60,5 @@ def fit_to_scenes(name: str, emulator: Emulator, scenes: Scenes, find: MatchFind
         return FittedModel(name, weights, emulator.matched(match), ", ".join(differing))
     for warning in match.warnings:
         warnings.warn(warning, stacklevel=3)
-    return FittedModel(name, weights, emulator.matched(match), describe_match(emulator, match), match.reading)
+    facts = f"{', '.join(differing) or 'materials'}; taken as {describe_match(emulator, match)}"
+    return FittedModel(name, weights, emulator.matched(match), facts, match.reading)

@@ -106,7 +106,7 @@ def test_a_model_of_another_gravity_takes_the_scenes_at_a_stride_and_says_so_or_
     gravity = tuple(4 * g for g in scenes.scene.gravity)
     other = tiny_emulator(dataclasses.replace(scenes.scene, gravity=gravity))
     model = next(c for c in make_choices(tiny_sweep(), scenes, {"other": other}) if c.kind is Kind.MODEL)
-    assert model.settings["scenes_differ_in"] == "1 frame for 2 of the data, gravity × 1"
+    assert model.settings["scenes_differ_in"] == "gravity; taken as 1 frame for 2 of the data, gravity × 1"
     predicted, _ = model.predict(scenes, 0)
     assert predicted.shape == scenes.window([0]).target.shape
     assert model.computed_frames(3) == 4  # a bundle of two frames, two of the scenes each
