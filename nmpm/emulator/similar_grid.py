@@ -51,6 +51,17 @@ def similar_grid(recipe: EmulatorRecipe, scene: Scene, scale: float) -> SimilarG
     return SimilarGrid(domain, cells, widths, sum(misfits))
 
 
+def aligned_scales(recipe: EmulatorRecipe, scene: Scene, scale: float, alignment: int) -> list[float]:
+    """Scales up to a third apart from one at which an axis has whole blocks of `alignment` cells, walls included."""
+    scales = []
+    for axis, (bounds, kind, width) in enumerate(zip(scene.bounds, scene.boundary, recipe.grid.spacing, strict=True)):
+        extent, walls = (bounds[1] - bounds[0]) / width, sum(_layers(recipe, axis, kind))
+        blocks = (extent / scale + walls) / alignment
+        numbers = (n for n in range(round(blocks) - 2, round(blocks) + 3) if 0.75 <= n / blocks <= 4 / 3)
+        scales += [extent / (n * alignment - walls) for n in numbers if n * alignment > walls]
+    return scales
+
+
 def _network_takes(recipe: EmulatorRecipe, periodic: bool) -> Callable[[int], bool]:
     """Whether the network takes so many cells along an axis, other axes alike."""
     dim = recipe.scene.dim

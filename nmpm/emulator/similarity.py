@@ -18,7 +18,7 @@ from nmpm.emulator.match_report import MatchReport
 from nmpm.emulator.material_names import match_materials
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.recipe import EmulatorRecipe
-from nmpm.emulator.similar_grid import SimilarGrid, similar_grid
+from nmpm.emulator.similar_grid import SimilarGrid, aligned_scales, similar_grid
 from nmpm.errors import ConfigError
 from nmpm.scene import Motion as Motion
 from nmpm.scene import Reading, Scene
@@ -30,6 +30,9 @@ _SHIFTS = tuple(1 + 0.002 * i for i in sorted(range(-20, 21), key=abs))
 """Factors on the best size of cells that are tried, for walls as in the model's scenes."""
 _SPEED_COST, _STRIDE_COST, _BETWEEN_COST, _WALL_COST = 0.5, 0.01, 0.04, 0.01
 """Weights of speeds beyond the model's, of the squared logarithms of strides k and 1/k, and of misfits of walls."""
+_BLOCK_COST = 0.06
+"""Of each axis whose end lies elsewhere in the blocks of cells that the network coarsens than in its training: there a
+model of one box errs up to ten times as much, even in free fall."""
 _SAME_UNITS = 4.0
 """Factor between the distances of particles of scenes that may be in the same unit of length."""
 _MOST_CELLS = 4_000_000
@@ -151,7 +154,14 @@ class _Search:
             ConfigError: if it would have too many cells.
         """
         recipe = self.emulator.recipe
-        pairs = [(stride, self._scale(stride) * shift) for stride in strides for shift in _SHIFTS]
+        pairs = [
+            (stride, scale)
+            for stride in strides
+            for scale in (
+                *(self._scale(stride) * shift for shift in _SHIFTS),
+                *aligned_scales(recipe, self.scene, self._scale(stride), self.emulator.processor.alignment),
+            )
+        ]
         choices = [(stride, similar_grid(recipe, self.scene, scale)) for stride, scale in pairs]
         stride, grid = min(choices, key=lambda choice: self._cost(*choice))
         if math.prod(grid.cells) > _MOST_CELLS:
@@ -181,7 +191,18 @@ class _Search:
             + _SPEED_COST * _deviation(max(1.0, self.seen.speed_excess(figures)))
             + (_STRIDE_COST if stride > 1 else _BETWEEN_COST) * math.log(stride) ** 2
             + _WALL_COST * grid.misfit
+            + _BLOCK_COST * self._axes_out_of_block(grid)
         )
+
+    def _axes_out_of_block(self, grid: SimilarGrid) -> int:
+        """Axes whose cells are another part of a block, of those that the network coarsens to one, than the model's.
+
+        None count for a model of grids of varied sizes.
+        """
+        if self.seen.varied_spacing:
+            return 0
+        block, usual = self.emulator.processor.alignment, self.emulator.grid.shape
+        return sum(n % block != m % block for n, m in zip(grid.cells, usual, strict=True))
 
     def _recipe(self, grid: SimilarGrid, stride: Fraction) -> EmulatorRecipe:
         """The model's form on a grid over the data, without a limit on energy that would not hold there."""
