@@ -108,7 +108,7 @@ def test_options_are_refused_before_torch_is_imported(words, message):
 
 
 TINY = [
-    *("--trainer.max_steps", "2", "--trainer.val_check_interval", "2", "--data.batch_size", "2"),
+    *("--trainer.max_steps", "2", "--data.batch_size", "2"),
     *("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false", "--model.unroll", "1"),
 ]
 
