@@ -19,12 +19,12 @@ _TOLERANCE = 0.25
 """Cells by which a mirror image's walls may be off: bounds of recorded data are widened by single stray particles."""
 
 
-def mirror_half(window: Window, scene: Scene, axes: Sequence[int]) -> Window:
+def mirror_half(window: Window, scene: Scene, grid: Grid, axes: Sequence[int]) -> Window:
     """The windows, half of them mirrored along each axis; each rank draws for its windows."""
     device = window.frames.device
     for axis in axes:
         draws = rank_slice(lambda rows: torch.rand(rows, device=device), len(window.frames))
-        window = mirror_windows(window, scene, axis, draws < 0.5)
+        window = mirror_windows(window, axis, _mirror_plane(scene, grid, axis), draws < 0.5)
     return window
 
 
@@ -36,8 +36,8 @@ def noisy_start(window: Window, deviation: float) -> Particles:
     return initial.with_motion(initial.position + deviation * normal_like(initial.position), initial.velocity)
 
 
-def check_mirrors(scene: Scene, grid: Grid, axes: Sequence[int]) -> None:
-    """Raise ConfigError if a mirror image along an axis is no scene of the same family: by its gravity, or walls."""
+def check_mirrors(scene: Scene, axes: Sequence[int]) -> None:
+    """Raise ConfigError if a mirror image along an axis is no scene of the same family, by its gravity."""
     for axis in axes:
         if not 0 <= axis < scene.dim:
             raise ConfigError(f"mirror: there is no axis {axis} in a scene of {scene.dim}.")
@@ -46,20 +46,17 @@ def check_mirrors(scene: Scene, grid: Grid, axes: Sequence[int]) -> None:
                 f"mirror: along axis {axis} the scene has gravity {scene.gravity[axis]}, so that its mirror image is "
                 "another scene; leave the axis out."
             )
-        (low, high), (outer_low, outer_high) = scene.bounds[axis], scene.domain[axis]
-        moved = abs(low + high - outer_low - outer_high) / grid.spacing[axis]
-        if moved > _TOLERANCE and not scene.periodic[axis]:
-            raise ConfigError(
-                f"mirror: along axis {axis} the bounds {(low, high)} do not lie in the middle of the domain"
-                f" {(outer_low, outer_high)}, about which windows are mirrored: walls of the images would be"
-                f" {moved:.2g} cells off. Leave the axis out, or give the data a domain with equal layers around the"
-                " bounds."
-            )
 
 
-def mirror_windows(window: Window, scene: Scene, axis: int, mirrored: Tensor) -> Window:
-    """Replace those of B windows where `mirrored` (B,) is True by their mirror image about the domain's middle."""
-    middle = sum(scene.domain[axis]) / 2
+def _mirror_plane(scene: Scene, grid: Grid, axis: int) -> float:
+    """The middle of the domain, or of the bounds where these are off it, as their images would be other walls."""
+    middle, between_walls = (sum(ends[axis]) / 2 for ends in (scene.domain, scene.bounds))
+    off = abs(between_walls - middle) > _TOLERANCE / 2 * grid.spacing[axis]
+    return between_walls if off and not scene.periodic[axis] else middle
+
+
+def mirror_windows(window: Window, axis: int, middle: float, mirrored: Tensor) -> Window:
+    """Replace those of B windows where `mirrored` (B,) is True by their mirror image about `middle` along an axis."""
     moved = window.obstacle_frames
     return dataclasses.replace(
         window,

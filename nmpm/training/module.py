@@ -106,7 +106,7 @@ class EmulatorModule(EvaluatedModule):
         self.error = TrainingError(density_weight, error_power)
         self.field_weight = field_weight
         self.mirror, self.jitter, self.position_noise = tuple(mirror), jitter, position_noise
-        check_mirrors(emulator.scene, emulator.grid, self.mirror)
+        check_mirrors(emulator.scene, self.mirror)
         check_jitter(emulator.scene, emulator.grid, jitter)
         self.recompute, self.compiled = recompute, compile
         self.record, self._recorded = record, RecordedSteps()
@@ -236,7 +236,8 @@ class EmulatorModule(EvaluatedModule):
         little more in a batch with fewer particles.
         """
         recorded = self.record and can_record(batch.frames.device)
-        batch = mirror_half(batch.padded(MULTIPLE) if recorded else batch, self.emulator.scene, self.mirror)
+        scene, grid = self.emulator.scene, self.emulator.grid
+        batch = mirror_half(batch.padded(MULTIPLE) if recorded else batch, scene, grid, self.mirror)
         start, emulator = noisy_start(batch, self.position_noise), with_jitter(self.emulator, self.jitter)
         count = self.bundles(self._progress())
         counts = counted(batch, count * emulator.frames, emulator.frames)
