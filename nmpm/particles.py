@@ -255,6 +255,17 @@ def _extended(values: Tensor, axis: int, by: int) -> Tensor:
     return torch.cat([values, more], dim=axis)
 
 
+def scene_volumes(volume: Tensor | None, mask: Tensor) -> Tensor | None:
+    """(B,) volume of each scene's particles, of (B, N) volumes; None where those of one scene differ.
+
+    Reads a value back from the device.
+    """
+    if volume is None:
+        return mask.new_ones(len(mask), dtype=torch.get_default_dtype())
+    of_scene = torch.where(mask, volume, 0.0).amax(1) if mask.shape[1] else volume.new_ones(len(volume))
+    return of_scene if bool(((volume == of_scene.unsqueeze(1)) | ~mask).all()) else None
+
+
 def _check_shapes(
     owner: Particles | Window, batch: int, count: int, dim: int, field_shapes: list[tuple[int, ...]]
 ) -> None:

@@ -99,8 +99,9 @@ def padded(state: Particles, position: Tensor, velocity: float = 0.3, field: flo
 def window_of(state: Particles, frames: Tensor) -> Window:
     """A window (B, T, N, D) of the particles, obstacles and gravity of a state."""
     return Window(
-        frames, state.material, state.mask, state.obstacle, state.obstacle_mask, state.gravity, dict(state.fields)
-    )
+        frames, state.material, state.mask, state.obstacle, state.obstacle_mask, state.gravity, dict(state.fields),
+        volume=state.volume,
+    )  # fmt: skip
 
 
 def set_gravity_statistics(emulator: Emulator, **values: list[float]) -> None:

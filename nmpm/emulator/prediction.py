@@ -23,7 +23,7 @@ from nmpm.emulator.bundle import Bundle, BundleStart, RolloutContext
 from nmpm.emulator.fused.arrays import ArrayCache
 from nmpm.emulator.fused.parameters import KernelParameters
 from nmpm.emulator.rasterise import grid_state
-from nmpm.particles import Particles
+from nmpm.particles import Particles, scene_volumes
 from nmpm.transfer.execution import kernels_take
 
 if TYPE_CHECKING:
@@ -144,6 +144,10 @@ class TrainingSteps(TensorSteps):
 
         given = (particles.position, particles.velocity, particles.gravity, particles.material, particles.mask)
         cells, velocity, gravity, state = Rasterise.apply(self.parameters, *given, solid)  # type: ignore[no-untyped-call]
+        if (volume := particles.volume) is not None and (of_scene := scene_volumes(volume, particles.mask)) is not None:
+            factor, (first, end) = state.new_ones(state.shape[:2]), self.parameters.volume_channels
+            factor[:, first:end] = of_scene.unsqueeze(1)
+            state = state * factor.reshape(*factor.shape, *(1,) * (state.dim() - 2))
         return cells, velocity, gravity, state
 
     def path(self, start: BundleStart, context: RolloutContext) -> Tensor:  # noqa: ARG002 (no constraint acts)
@@ -159,20 +163,24 @@ class TrainingSteps(TensorSteps):
 def steps_for(emulator: Emulator, particles: Particles, solid: Tensor) -> Steps:
     """The kernels where they can do what is asked for, else tensor operations.
 
-    Kernels run on a CPU, in float32, for the parts of this package (`kernel_parameters`), particles of one size and
-    obstacles at rest, outside of `without_kernels`: in training mode those with gradients, if neither obstacles nor
-    gravity need any; in evaluation mode those without. Graphs that `torch.compile` traces take tensor operations.
+    Kernels run on a CPU, in float32, for the parts of this package (`kernel_parameters`) and obstacles at rest, outside
+    of `without_kernels`. In training mode those with gradients, if neither obstacles nor gravity need any and the
+    particles of each scene are of one size; in evaluation mode those without, if all particles are of the scene's size.
+    Graphs that `torch.compile` traces take tensor operations.
     """
     motion, fixed = (particles.position, particles.velocity), (particles.gravity, solid)
     parameters, is_float32 = emulator.kernel_parameters, emulator.precision == torch.float32
     if parameters is None or not is_float32 or not kernels_take(*motion, particles.gravity):
         return TensorSteps(emulator)
-    if particles.volume is not None or particles.obstacle_velocity is not None:
+    if particles.obstacle_velocity is not None:
         return TensorSteps(emulator)
     if torch.compiler.is_compiling() or _need_gradients(fixed):
         return TensorSteps(emulator)
     if emulator.training:
-        return TrainingSteps(emulator, parameters) if parameters.trains else TensorSteps(emulator)
+        takes = parameters.trains and scene_volumes(particles.volume, particles.mask) is not None
+        return TrainingSteps(emulator, parameters) if takes else TensorSteps(emulator)
+    if particles.volume is not None:
+        return TensorSteps(emulator)
     if _need_gradients(motion) or _need_gradients(emulator.parameters()):
         return TensorSteps(emulator)
     return FusedSteps(emulator, parameters)

@@ -17,7 +17,7 @@ from torch import Tensor
 from nmpm.emulator.prescribed import predicted_particles
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.particles import Window
+from nmpm.particles import Window, scene_volumes
 from nmpm.scene import Scene
 from nmpm.transfer import Linear
 from nmpm.transfer.execution import kernels_take
@@ -198,9 +198,11 @@ def density_error(
     """
     fraction = scene.particle_volume / grid.cell_volume
     cells = (grid.to_cells(frames, frames.dtype) for frames in (predicted, target))
-    if there is None and window.volume is None and _kernels_support(predicted, target, grid):
-        predicted_fraction, true_fraction = (fraction * _kernel_counts(of, window, scene, grid) for of in cells)
-        total = window.mask.sum() * predicted.shape[1]
+    kernels = there is None and _kernels_support(predicted, target, grid)
+    if kernels and (sizes := scene_volumes(window.volume, window.mask)) is not None:
+        scale = fraction * sizes.view(-1, 1, 1, 1)
+        predicted_fraction, true_fraction = (scale * _kernel_counts(of, window, scene, grid) for of in cells)
+        total = (window.mask.sum(1) * sizes).sum() * predicted.shape[1]
     else:
         volume = _volumes(window, predicted.shape[1], scene, there).to(predicted.dtype)
         sums = (Linear().p2g(volume.flatten(0, 1), of.flatten(0, 1), grid) for of in cells)

@@ -286,10 +286,13 @@ def train_once(emulator, particles):
     return loss, predicted, [torch.zeros(()) if each is None else each for each in gradients]
 
 
-def check_training(walls, materials, decoder, obstacles, count, seed=0, speed=0.005):
+def check_training(walls, materials, decoder, obstacles, count, seed=0, speed=0.005, sizes=None):
     scene = scene_of(2, walls, materials, obstacles)
     emulator, particles = trained(scene, seed, decoder=decoder), cloud(scene, count, 2, speed, seed, 5 * obstacles)
     particles.mask[1, (count + 1) // 2 :] = False
+    if sizes is not None:
+        volume = torch.where(particles.mask, torch.tensor(sizes).unsqueeze(1), 1.0)
+        particles = dataclasses.replace(particles, volume=volume)
     assert steps_of(emulator, particles) is TrainingSteps
     loss, predicted, gradients = train_once(emulator, particles)
     with without_kernels():
@@ -313,6 +316,12 @@ def check_training(walls, materials, decoder, obstacles, count, seed=0, speed=0.
 )
 def test_training_has_the_same_values_and_gradients(walls, materials, decoder, obstacles, speed):
     check_training(walls, materials, decoder, obstacles, 200, speed=speed)
+
+
+def test_scenes_may_have_particles_of_a_size_of_their_own_in_training():
+    check_training((True, True), 2, Residual(), True, 100, sizes=(0.4, 2.5))
+    several = dataclasses.replace(cloud(box(), 10), volume=torch.linspace(1.0, 2.0, 10).expand(1, -1))
+    assert steps_of(emulator_of(box()).train(), several) is TensorSteps
 
 
 @pytest.mark.slow
