@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,8 +18,9 @@ from nmpm.cli.match_options import MATERIALS, STRICT, STRIDE, MatchOptions, desc
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.dataset import Dataset
 from nmpm.data.loading.sources import FolderSource
+from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.similarity import Match
-from nmpm.errors import NmpmError
+from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.matched import is_plain
 from nmpm.scene import Scene
 from nmpm.training.checkpoints import COMPARED, read_checkpoint
@@ -52,12 +54,14 @@ class MatchedRun:
         model: On the data.
         match: With them.
         scene: Of the data, as they are.
-        left_out: Arguments of the configuration that the model's take the place of.
+        different: Arguments of the configuration that are not the model's, which take their place.
+        left_out: Those of them that the configuration or an option states.
     """
 
     model: Pretrained
     match: Match
     scene: Scene
+    different: tuple[str, ...]
     left_out: tuple[str, ...] = ()
 
     @classmethod
@@ -79,10 +83,9 @@ class MatchedRun:
         match = match_data(
             model, described, *MatchOptions.read(config["materials"], config["stride"], config["strict"])
         )
-        plain = match.recipe.to_dict()
+        different = tuple(key for key in FORM if _differs(config["model"][key], match.recipe, key))
         stated = stated_keys(read_options(sys.argv[2:]), "model") if checkpoint is None else set()
-        left_out = [key for key in FORM if key in stated and _differs(config["model"][key], plain.get(key))]
-        return cls(model.matched(match), match, data.scene, tuple(left_out))
+        return cls(model.matched(match), match, data.scene, different, tuple(k for k in different if k in stated))
 
     def __str__(self) -> str:
         """Lines on how the model takes the data, and on what is left out of the configuration; none if neither."""
@@ -99,7 +102,7 @@ class MatchedRun:
     def complete(self, config: Namespace) -> None:
         """Put the model's form, and how the data are read, into a configuration."""
         plain = self.match.recipe.to_dict()
-        for key in FORM:
+        for key in self.different:
             config["model"][key] = _namespace(plain.get(key))
         if "horizon" in config["data"]:  # at least to the next frame that the data have
             unroll = max(config["model"]["unroll"], -(-self.match.reading.between // plain["frames"]))
@@ -125,6 +128,10 @@ def _namespace(plain: Any) -> Any:
     return plain
 
 
-def _differs(configured: Any, value: Any) -> bool:
-    given = configured.as_dict() if isinstance(configured, Namespace) else configured
-    return bool(to_plain(given) != value)
+def _differs(configured: Any, recipe: EmulatorRecipe, key: str) -> bool:
+    """Whether a configured part of a recipe is another than the recipe's, or none that it could have."""
+    changed: dict[str, Any] = {key: configured.as_dict() if isinstance(configured, Namespace) else configured}
+    try:
+        return bool(getattr(dataclasses.replace(recipe, **changed), key) != getattr(recipe, key))
+    except ConfigError:
+        return True

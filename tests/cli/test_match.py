@@ -176,6 +176,17 @@ def test_a_configuration_s_form_is_left_out_with_a_line(monkeypatch):
     assert cli.model.unroll * recipe.frames == cli.datamodule.horizon >= 16  # to the next frame of the data
 
 
+def test_on_data_of_its_own_a_model_changes_nothing_of_its_configuration(monkeypatch, make_dataset):
+    built = []
+    monkeypatch.setattr(EmulatorCLI, "_run_subcommand", lambda cli, _: built.append(cli))
+    data = make_dataset(train=((40, 9),), valid=((40, 9),), particle_volume=5.1e-5)
+    assert main(["fit", "--config", "goop.yaml", "--start_from", "goop", "--data.path", str(data), *TINY]) == 0
+    (cli,) = built
+    assert str(cli.matched) == ""
+    assert cli.config["fit"]["model"]["cells"] == 32
+    assert cli.datamodule.reading is None
+
+
 def test_models_are_compared_on_data_of_another_kind(capsys, monkeypatch):
     sweep = (
         "{scenes: 2, timing: {rounds: 1, frames: 4}, models: {precision: [float32], constraints: [held], batch: [1]}}"
