@@ -33,6 +33,8 @@ _SPEED_COST, _STRIDE_COST, _BETWEEN_COST, _WALL_COST = 0.5, 0.01, 0.04, 0.01
 _BLOCK_COST = 0.06
 """Of each axis whose end lies elsewhere in the blocks of cells that the network coarsens than in its training: there a
 model of one box errs up to ten times as much, even in free fall."""
+_COARSE_COST = 0.3
+"""Of a box that is fewer cells across than the model's: heaps and gaps of few cells are predicted worst."""
 _SAME_UNITS = 4.0
 """Factor between the distances of particles of scenes that may be in the same unit of length."""
 _MOST_CELLS = 4_000_000
@@ -192,6 +194,7 @@ class _Search:
             + (_STRIDE_COST if stride > 1 else _BETWEEN_COST) * math.log(stride) ** 2
             + _WALL_COST * grid.misfit
             + _BLOCK_COST * self._axes_out_of_block(grid)
+            + _COARSE_COST * self._coarseness(grid) ** 2
         )
 
     def _axes_out_of_block(self, grid: SimilarGrid) -> int:
@@ -203,6 +206,14 @@ class _Search:
             return 0
         block, usual = self.emulator.processor.alignment, self.emulator.grid.shape
         return sum(n % block != m % block for n, m in zip(grid.cells, usual, strict=True))
+
+    def _coarseness(self, grid: SimilarGrid) -> float:
+        """Logarithm of the model's cells across its box over those across this one; 0 if these are more.
+
+        It is 0 for a model of grids of varied sizes.
+        """
+        fewer = math.prod(self.emulator.grid.shape) / math.prod(grid.cells)
+        return 0.0 if self.seen.varied_spacing else math.log(max(1.0, fewer)) / len(grid.cells)
 
     def _recipe(self, grid: SimilarGrid, stride: Fraction) -> EmulatorRecipe:
         """The model's form on a grid over the data, without a limit on energy that would not hold there."""

@@ -237,3 +237,11 @@ def test_the_box_ends_at_a_block_of_the_coarsest_cells_as_in_training():
         particle_volume=model.particle_volume * 100**2, gravity=(0.0, -1000.0),
     )  # fmt: skip
     assert all(cells % 8 == 0 for cells in find_match(emulator, wide).recipe.cells)
+
+
+def test_a_box_of_fewer_cells_than_the_models_gets_finer_ones():
+    emulator = model_of()
+    scene = in_other_units(emulator.scene)
+    small = dataclasses.replace(scene, bounds=((0.0, 60.0), (0.0, 60.0)), domain=((-2.0, 62.0), (-2.0, 62.0)))
+    width = find_match(emulator, small).recipe.grid.spacing[0]
+    assert 0.7 < width / (250 * emulator.grid.spacing[0]) < 0.98
