@@ -21,7 +21,6 @@ from nmpm.data.loading.sources import FolderSource
 from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.similarity import Match
 from nmpm.errors import ConfigError, NmpmError
-from nmpm.evaluation.matched import is_plain
 from nmpm.scene import Scene
 from nmpm.training.checkpoints import COMPARED, read_checkpoint
 from nmpm.zoo.entries import load_checkpoint
@@ -97,7 +96,7 @@ class MatchedRun:
 
     @property
     def _is_same_kind(self) -> bool:
-        return is_plain(self.match.reading) and self.match.reading.scene == self.scene
+        return self.match.reading.is_plain and self.match.reading.scene == self.scene
 
     def complete(self, config: Namespace) -> None:
         """Put the model's form, and how the data are read, into a configuration."""

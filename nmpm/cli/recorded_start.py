@@ -26,9 +26,7 @@ from nmpm.particles import Window
 from nmpm.scene import Reading, Scene
 from nmpm.zoo import Pretrained
 from nmpm.zoo.matching import match_data
-
-SAME_GRAVITY = 0.05
-"""Share of the model's gravity by which that of data may differ, as it may be measured."""
+from nmpm.zoo.starts import is_gravity_of
 
 
 @dataclass(frozen=True)
@@ -109,6 +107,4 @@ def is_of_kind(scene: Scene, metadata: Metadata, split: Split, index: int) -> bo
     gravity = trajectory_gravity(split.attributes(index), metadata, split.where(index))
     if not np.isclose(metadata.dt, scene.dt, rtol=1e-3):
         return gravity is None and "dt" in guessed
-    if scene.gravity_varies or gravity is None or scene.gravity is None:
-        return True
-    return bool(np.allclose(gravity, scene.gravity, rtol=0, atol=SAME_GRAVITY * float(np.abs(scene.gravity).max())))
+    return scene.gravity_varies or gravity is None or scene.gravity is None or is_gravity_of(scene, gravity)

@@ -22,9 +22,6 @@ from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
     from nmpm.emulator import Emulator
-    from nmpm.emulator.similarity import Match
-    from nmpm.evaluation.matched import MatchFinder
-    from nmpm.scene import Motion, Scene
 
 DESCRIPTION = """Measure the trade between speed and accuracy: time and errors of emulators, of the simulator with fewer
 substeps and on coarser grids, and of trivial predictors, on the same test scenes and machine. Answers what to run for
@@ -116,7 +113,9 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
         scenes = trade.find_wider_scenes(dataset, sweep.scenes, options.wider)
     else:
         scenes = trade.find_scenes(dataset, sweep.scenes)
-    choices = trade.make_choices(sweep, scenes, models, find_device(options.device), predictors, _finder(models, match))
+    _check_materials(match, models)
+    device = find_device(options.device)
+    choices = trade.make_choices(sweep, scenes, models, device, predictors, **match._asdict())
     if not choices:
         raise ConfigError("There is nothing to measure: give --models, or settings of the simulator.")
     points = trade.measure(choices, scenes, sweep, trade.Store(out), command)
@@ -129,26 +128,12 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
     sys.stderr.write(f"wrote {', '.join(map(str, paths))}\n")
 
 
-def _finder(models: Mapping[str, Emulator], match: MatchOptions) -> MatchFinder:
-    """What matches each of the models: by the options, of which names of materials are for the models that have them.
-
-    Raises:
-        ConfigError: if no model has them.
-    """
-    from nmpm.emulator.similarity import find_match
-
+def _check_materials(match: MatchOptions, models: Mapping[str, Emulator]) -> None:
+    """Raise ConfigError if no model has the materials that an option names; those that have are matched by them."""
     named = set((match.materials or {}).values())
     if models and not any(named <= set(emulator.scene.materials) for emulator in models.values()):
         known = sorted({name for emulator in models.values() for name in emulator.scene.materials})
         raise ConfigError(f"--materials: no model has {', '.join(sorted(named))}; they have {', '.join(known)}.")
-
-    def find(
-        emulator: Emulator, scene: Scene, motion: Motion | None = None, *, names: tuple[str, str] = ("", "")
-    ) -> Match:
-        materials = match.materials if named <= set(emulator.scene.materials) else None
-        return find_match(emulator, scene, motion, materials, match.stride, match.strict, names)
-
-    return find
 
 
 def _load_models(names: list[str]) -> dict[str, Emulator]:

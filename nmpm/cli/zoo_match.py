@@ -92,7 +92,7 @@ def _row(one: Standing) -> list[str]:
         error,
         "×".join(map(str, recipe.grid.shape)),
         str(reading.every) if reading.between == 1 else f"1/{reading.between}",
-        "" if one.gravity is None else f"× {one.gravity:.3g}",
+        "" if one.match.gravity is None else f"× {one.match.gravity:.3g}",
         ", ".join(f"{name}={theirs}" for name, theirs in (one.stated or {}).items()),
         ", ".join([*unmatched, *([one.failure] if one.failure else [])]),
     ]

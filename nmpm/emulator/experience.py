@@ -40,7 +40,7 @@ class Figures:
     def of(cls, scene: Scene, motion: Motion | None, widths: Sequence[float], stride: Fraction) -> Figures:
         """The figures on cells of some widths (D,), in the data's units, with so many frames of the data for one."""
         width, frames = mean_width(widths), float(stride)
-        gravity = _gravity_in_cells(scene.gravity or (motion.gravity if motion else None), scene.dt, widths)
+        gravity = gravity_in_cells(scene.gravity or (motion.gravity if motion else None), scene.dt, widths)
         return cls(
             gravity=None if gravity is None else gravity * frames**2,
             rms=motion.rms * frames / width if motion else None,
@@ -111,7 +111,7 @@ def mean_width(widths: Sequence[float]) -> float:
     return widths[0] if len(set(widths)) == 1 else math.prod(widths) ** (1 / len(widths))
 
 
-def _gravity_in_cells(gravity: Sequence[float] | None, dt: float, widths: Sequence[float]) -> float | None:
+def gravity_in_cells(gravity: Sequence[float] | None, dt: float, widths: Sequence[float]) -> float | None:
     """|g| Δt²/h; None where gravity is unknown or zero."""
     if not gravity or not any(gravity):
         return None
@@ -120,7 +120,7 @@ def _gravity_in_cells(gravity: Sequence[float] | None, dt: float, widths: Sequen
 
 def _gravities(emulator: Emulator) -> Interval | None:
     if not emulator.scene.gravity_varies:
-        only = _gravity_in_cells(emulator.scene.gravity, emulator.scene.dt, emulator.grid.spacing)
+        only = gravity_in_cells(emulator.scene.gravity, emulator.scene.dt, emulator.grid.spacing)
         return None if only is None else (only, only)
     rms = math.sqrt(_mean_square(emulator, "gravity_"))
     if not emulator.calibrated or not rms:

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from nmpm.emulator.experience import Experience, Figures, clamp, mean_width
+from nmpm.emulator.experience import Experience, Figures, clamp, gravity_in_cells, mean_width
 from nmpm.emulator.match_report import MatchReport
 from nmpm.emulator.material_names import match_materials
 from nmpm.emulator.model import Emulator
@@ -49,12 +49,14 @@ class Match:
         reading: How the data are read for it.
         lines: Cells, frames, gravity, particles and materials, a line each, to be checked by eye.
         warnings: What could not be matched, with its factor.
+        gravity: The data's over the model's, in cells per frame²; None where one has none, or several.
     """
 
     recipe: EmulatorRecipe
     reading: Reading
     lines: tuple[str, ...]
     warnings: tuple[str, ...]
+    gravity: float | None = None
 
 
 def find_match(
@@ -102,7 +104,9 @@ def find_match(
     differing = {name: to for name, to in mapping.names.items() if to != name}
     reading = Reading(recipe.scene, differing, chosen_stride.numerator, chosen_stride.denominator)
     bodies = "; obstacles -> solid channel" if scene.obstacles else ""
-    return Match(recipe, reading, (*report.lines(), f"materials  {mapping}{bodies}"), warnings)
+    pulls = [gravity_in_cells(of.scene.gravity, of.scene.dt, of.grid.spacing) for of in (recipe, emulator.recipe)]
+    factor = pulls[0] / pulls[1] if pulls[0] and pulls[1] else None
+    return Match(recipe, reading, (*report.lines(), f"materials  {mapping}{bodies}"), warnings, factor)
 
 
 def _with_channels_of(model: Scene, scene: Scene) -> Scene:

@@ -3,53 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from nmpm._support.messages import counted
-from nmpm.data.loading.model_frames import model_velocity
-from nmpm.emulator import Emulator, EmulatorRecipe, Prescribed, rollout
+from nmpm.data.loading.model_frames import interpolate, model_velocity
+from nmpm.emulator import Emulator, Prescribed, rollout
 from nmpm.emulator.prescribed import predict_from_entries
-from nmpm.emulator.similarity import Match
 from nmpm.particles import Particles, Window
-from nmpm.scene import Motion, Reading, Scene
-
-
-class MatchFinder(Protocol):
-    """`nmpm.emulator.similarity.find_match`, or that with some of its arguments given."""
-
-    def __call__(
-        self, emulator: Emulator, scene: Scene, motion: Motion | None = None, *, names: tuple[str, str] = ...
-    ) -> Match: ...
-
-
-def is_plain(reading: Reading) -> bool:
-    """Whether a dataset is read as it is, with its own materials and frames."""
-    return not reading.materials and reading.every == reading.between == 1
-
-
-def describe_match(emulator: Emulator, match: Match) -> str:
-    """How a model takes scenes of another kind, in a phrase: "4 frames for 1 of the data, gravity × 1.02"."""
-    factor = gravity_factor(emulator, match)
-    gravity = "" if factor is None else f", gravity × {factor:.3g}"
-    return f"{counted(match.reading.between, 'frame')} for {match.reading.every} of the data{gravity}"
-
-
-def gravity_factor(emulator: Emulator, match: Match) -> float | None:
-    """Gravity of the data over the model's, in cells per frame²; None where one has none, or several."""
-    ours, theirs = gravity_in_cells(emulator.recipe), gravity_in_cells(match.recipe)
-    return theirs / ours if ours and theirs else None
-
-
-def gravity_in_cells(recipe: EmulatorRecipe) -> float:
-    """|g| Δt²/h of the scenes, in cells per frame²; 0 where they have none, or each its own."""
-    gravity = recipe.scene.gravity or (0.0,) * recipe.scene.dim
-    return math.hypot(*(g / h for g, h in zip(gravity, recipe.grid.spacing, strict=True))) * recipe.scene.dt**2
+from nmpm.scene import Reading, Scene
 
 
 @dataclass(frozen=True)
@@ -108,20 +72,21 @@ class MatchedPredictor:
         path = rollout(self.emulator, state, self.steps(frames), prescribed=prescribed)
         if self.reading.every == 1:
             return path[:, self.reading.between - 1 :: self.reading.between]
-        return between_frames(torch.cat([state.position.unsqueeze(1), path], 1), self.reading.every)[:, 1 : frames + 1]
+        return interpolate(torch.cat([state.position.unsqueeze(1), path], 1), self.reading.every)[:, 1 : frames + 1]
 
     def state(self, particles: Particles) -> Particles:
         """A state of the dataset in the model's materials, with velocity and gravity per frame of the model."""
         ratio, gravity = self.reading.every / self.reading.between, self._gravity(particles)
         unknown = torch.full_like(particles.velocity, torch.nan)
         velocity = model_velocity(particles.velocity, unknown, gravity.unsqueeze(1), ratio)
-        index = torch.tensor(material_indices(self.scene, self.reading)).to(gravity.device)
+        names, theirs = self.reading.materials, self.reading.scene
+        index = torch.tensor([theirs.material_index(names.get(name, name)) for name in self.scene.materials])
         last = particles.obstacle_velocity
         return dataclasses.replace(
             particles,
             velocity=velocity,
             gravity=gravity * ratio**2,
-            material=index[particles.material],
+            material=index.to(gravity.device)[particles.material],
             obstacle_velocity=None if last is None else last * ratio,
         )
 
@@ -134,16 +99,4 @@ class MatchedPredictor:
 
     def _obstacle_path(self, frames: Tensor) -> Tensor:
         """Positions (B, F', M, D) of obstacles at the model's frames, of (B, F, M, D) at the dataset's."""
-        return between_frames(frames[:, :: self.reading.every], self.reading.between)
-
-
-def material_indices(scene: Scene, reading: Reading) -> Sequence[int]:
-    """The index of the model's material of each of a dataset's."""
-    return [reading.scene.material_index(reading.materials.get(name, name)) for name in scene.materials]
-
-
-def between_frames(frames: Tensor, parts: int) -> Tensor:
-    """(B, (T - 1) parts + 1, N, D) frames, of (B, T, N, D) ones, with others linearly between them."""
-    share = torch.arange(parts, device=frames.device, dtype=frames.dtype).view(1, 1, -1, 1, 1) / parts
-    first, second = frames[:, :-1].unsqueeze(2), frames[:, 1:].unsqueeze(2)
-    return torch.cat([torch.lerp(first, second, share).flatten(1, 2), frames[:, -1:]], 1)
+        return interpolate(frames[:, :: self.reading.every], self.reading.between)

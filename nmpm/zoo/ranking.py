@@ -14,7 +14,7 @@ from torch import Tensor
 from nmpm._support.messages import one_line
 from nmpm.data.dataset import Dataset
 from nmpm.data.format import split_paths
-from nmpm.data.loading.padded_batch import PaddedRecordings, displacements
+from nmpm.data.loading.padded_batch import PaddedRecordings
 from nmpm.data.loading.recording import Recording
 from nmpm.data.motion import measure_motion
 from nmpm.emulator import Emulator
@@ -22,15 +22,15 @@ from nmpm.emulator.prescribed import predict_from_entries, with_predicted
 from nmpm.emulator.similarity import Match, find_match
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.comparison import free_fall, still
-from nmpm.evaluation.matched import MatchedPredictor, gravity_factor
+from nmpm.evaluation.matched import MatchedPredictor
+from nmpm.evaluation.trade.scenes import moving_frames
+from nmpm.metrics import MSE
 from nmpm.particles import Window
 from nmpm.scene import Motion, Scene
 
 FRAMES = 32
 """Frames of the data that are predicted, or as many as there are."""
 _WINDOWS = 3
-_MOVING = 0.02
-"""A trajectory moves while its mean speed is at least this share of its largest."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Trial:
         taken = [recordings[number] for number in range(min(_WINDOWS, len(recordings)))]
         window = _windows([taken[turn % len(taken)] for turn in range(_WINDOWS)], data.scene)
         errors = [
-            mean_squared_error(predict_from_entries(predictor, window, 1), with_predicted(window, 1))
+            _mean_squared_error(predict_from_entries(predictor, window, 1), with_predicted(window, 1))
             for predictor in (still, partial(free_fall, data.scene))
         ]
         return cls(data.source.path.name, data.scene, measure_motion(data.folder, data.metadata), window, *errors)
@@ -86,22 +86,15 @@ def _windows(recordings: Sequence[Recording], scene: Scene) -> Window:
     length = min(FRAMES + 2, *(len(recording.frames) for recording in recordings))
     starts = []
     for number, recording in enumerate(recordings):
-        last = min(_moving_frames(recording, scene), len(recording.frames)) - length
+        last = moving_frames(recording, scene) + 2 - length
         starts.append(max(0, round(last * number / len(recordings))))
     return PaddedRecordings.stack(recordings, scene).gather(range(len(recordings)), starts, length)
 
 
-def _moving_frames(recording: Recording, scene: Scene) -> int:
-    speed = displacements(recording.frames, scene).square().sum(-1).mean(-1).sqrt()
-    moving = (speed >= _MOVING * speed.max()).nonzero()
-    return int(moving[-1]) + 2 if len(moving) else 0
-
-
-def mean_squared_error(predicted: Tensor, window: Window) -> float:
-    """Mean over windows, frames, present particles and axes, in length²; of (B, T - 2, N, D) positions."""
-    there = window.mask.unsqueeze(1) if window.present is None else window.present[:, 2:] & window.mask.unsqueeze(1)
-    squared = (predicted - window.target).double().square().mean(-1)
-    return float(squared[there.expand_as(squared)].mean())
+def _mean_squared_error(predicted: Tensor, window: Window) -> float:
+    error = MSE(())
+    error.update(window, predicted)
+    return float(error.compute()["mse"])
 
 
 @dataclass(frozen=True)
@@ -112,7 +105,6 @@ class Standing:
         model: Its name.
         error: Mean squared error over that of the better trivial predictor; infinite where it fails.
         match: How it takes the data; None where it cannot.
-        gravity: Factor of the data's over the model's, in cells per frame²; None where either has none.
         failure: Why there is no error; else empty.
         stated: The model's material by the data's name, where the names do not tell.
     """
@@ -120,7 +112,6 @@ class Standing:
     model: str
     error: float = math.inf
     match: Match | None = None
-    gravity: float | None = None
     failure: str = ""
     stated: Mapping[str, str] | None = None
 
@@ -186,6 +177,6 @@ class Ranking:
                 predicted = predictor.predict(trial.window)
         except NmpmError as error:
             return Standing(name, failure=one_line(error), stated=materials)
-        mean = mean_squared_error(predicted, with_predicted(trial.window, predictor.bundle))
+        mean = _mean_squared_error(predicted, with_predicted(trial.window, predictor.bundle))
         relative, failure = (mean / trial.trivial, "") if math.isfinite(mean) else (math.inf, "not finite")
-        return Standing(name, relative, match, gravity_factor(emulator, match), failure, materials)
+        return Standing(name, relative, match, failure, materials)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,11 +18,13 @@ from nmpm.data.statistics import displacements
 from nmpm.data.volumes import relative_volumes
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Particles
+from nmpm.scene import Scene
 
 if TYPE_CHECKING:
     from nmpm.zoo.pretrained import Pretrained
 
 _SAME_GRAVITY = 0.05
+"""Share of the model's gravity by which that of data may differ, as it may be measured."""
 
 
 def state_of(
@@ -117,8 +119,13 @@ def _gravity(model: Pretrained, trajectory: Trajectory, metadata: Metadata) -> A
     scene, gravity = model.scene, trajectory_gravity(trajectory.attributes, metadata, "the trajectory")
     if scene.gravity_varies or gravity is None or scene.gravity is None:
         return gravity if scene.gravity_varies else None
-    limit = _SAME_GRAVITY * float(np.abs(scene.gravity).max())  # it may be measured
-    return None if np.allclose(gravity, scene.gravity, rtol=0, atol=limit) else gravity
+    return None if is_gravity_of(scene, gravity) else gravity
+
+
+def is_gravity_of(scene: Scene, gravity: Sequence[float]) -> bool:
+    """Whether a trajectory's gravity, which may be measured, is that of a model's scene."""
+    stated = np.array(scene.gravity)
+    return np.allclose(gravity, stated, rtol=0, atol=_SAME_GRAVITY * float(np.abs(stated).max()))
 
 
 def _fields(model: Pretrained, trajectory: Trajectory, frame: int, moving: np.ndarray) -> dict[str, Any]:

@@ -55,7 +55,11 @@ def add_frames(window: Window, between: int, has_earlier: Tensor) -> Window:
         window.gravity.unsqueeze(1) * between**2,
         1 / between,
     )
-    path = interpolate(frames[:, 1:], between, change.where(change_known, 0.0)[:, 1:])
+
+    def model_frames(values: Tensor, change: Tensor | None = None) -> Tensor:
+        return interpolate(values[:, 1:], between, change)[:, between - 1 :]
+
+    path = model_frames(frames, change.where(change_known, 0.0)[:, 1:])
     path[:, 0] = path[:, 1] - velocity
     observed = torch.zeros(path.shape[:2], dtype=torch.bool, device=path.device)
     observed[:, 1::between] = True
@@ -63,9 +67,9 @@ def add_frames(window: Window, between: int, has_earlier: Tensor) -> Window:
     return dataclasses.replace(
         window,
         frames=path,
-        fields={n: v if v.shape[1] == 1 else interpolate(v[:, 1:], between) for n, v in fields.items()},
-        present=None if present is None else interpolate(present[:, 1:].float(), between) == 1,
-        obstacle_frames=None if moved is None else interpolate(moved[:, 1:], between),
+        fields={n: v if v.shape[1] == 1 else model_frames(v) for n, v in fields.items()},
+        present=None if present is None else model_frames(present.float()) == 1,
+        obstacle_frames=None if moved is None else model_frames(moved),
         observed=observed,
     )
 
@@ -91,7 +95,7 @@ def model_velocity(step: Tensor, change: Tensor, gravity: Tensor, ratio: float) 
 
 
 def interpolate(values: Tensor, between: int, change: Tensor | None = None) -> Tensor:
-    """Values at the model's frames (B, 2 + k (S - 2), …), from one before the second of (B, S, …) at the data's.
+    """Values at every frame of the model, (B, k (S - 1) + 1, …), of (B, S, …) at those of the data.
 
     Args:
         values: At S frames, 2 or more.
@@ -106,4 +110,4 @@ def interpolate(values: Tensor, between: int, change: Tensor | None = None) -> T
         first = torch.cat([change[:, :1], change], dim=1)
         last = torch.cat([change, change[:, -1:]], dim=1)
         path = path + share * (share - 1) / 4 * (first + last).unsqueeze(2)
-    return torch.cat([path.flatten(1, 2)[:, between - 1 :], values[:, -1:]], dim=1)
+    return torch.cat([path.flatten(1, 2), values[:, -1:]], dim=1)

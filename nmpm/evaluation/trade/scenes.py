@@ -68,10 +68,7 @@ class Scenes:
 
     def moving_frames(self, index: int) -> int:
         """Predicted frames until the scene comes to rest, see `MOVING`; at least 1."""
-        steps = displacements(self.recordings[index].frames[1:], self.scene)
-        speed = steps.square().sum(-1).mean(-1).sqrt()
-        moving = (speed >= MOVING * speed.max()).nonzero()
-        return int(moving[-1]) + 1 if len(moving) else 1
+        return moving_frames(self.recordings[index], self.scene)
 
     def shown_frames(self) -> list[int]:
         """Indices of the predicted frames of the first scene that pictures show."""
@@ -98,6 +95,13 @@ class Scenes:
                 digest.update(values.contiguous().numpy().tobytes())
             digests.append(digest.hexdigest()[:16])
         return tuple(digests)
+
+
+def moving_frames(recording: Recording, scene: Scene) -> int:
+    """Predicted frames until a recording comes to rest, see `MOVING`; at least 1."""
+    speed = displacements(recording.frames[1:], scene).square().sum(-1).mean(-1).sqrt()
+    moving = (speed >= MOVING * speed.max()).nonzero()
+    return int(moving[-1]) + 1 if len(moving) else 1
 
 
 def find_scenes(dataset: str, count: int) -> Scenes:

@@ -17,10 +17,9 @@ from nmpm._support.bounded_files import parse_yaml
 from nmpm._support.messages import counted
 from nmpm._support.plain_data import from_plain
 from nmpm.emulator import NETWORK_PRECISIONS, Emulator
-from nmpm.emulator.similarity import find_match
 from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import free_fall, still
-from nmpm.evaluation.matched import MatchedPredictor, MatchFinder
+from nmpm.evaluation.matched import MatchedPredictor
 from nmpm.evaluation.prediction_errors import Measures
 from nmpm.evaluation.trade.choices import (
     CPU,
@@ -146,7 +145,7 @@ def make_choices(
     models: Mapping[str, Emulator],
     device: torch.device = CPU,
     predictors: Sequence[Callable[[Scene], Predictor]] = (),
-    find: MatchFinder = find_match,
+    **match: Any,
 ) -> list[Choice]:
     """All choices of a sweep.
 
@@ -156,7 +155,7 @@ def make_choices(
         models: Trained emulators on the CPU, by name; those of other scenes are rebuilt for these.
         device: Where they compute.
         predictors: Make those of other packages.
-        find: Matches a model and scenes of another kind: `find_match`, or that with some of its arguments given.
+        match: How models take scenes of another kind: `materials`, `stride` and `strict` of `fit_to_scenes`.
 
     Raises:
         ConfigError: if a model cannot take the scenes, there is no such setting, or two choices have one name.
@@ -165,7 +164,7 @@ def make_choices(
     if scenes.preset is not None:
         choices += _simulator_choices(sweep.simulator, scenes.preset)
     for name, emulator in models.items():
-        choices += _model_choices(sweep.models, fit_to_scenes(name, emulator, scenes, find), scenes, device)
+        choices += _model_choices(sweep.models, fit_to_scenes(name, emulator, scenes, **match), scenes, device)
     some_enter = any(recording.present is not None for recording in scenes.recordings)
     bundles = [emulator.frames for emulator in models.values()] if some_enter else []
     predict_by = partial(PredictorChoice, enter_every=max(bundles, default=1))
