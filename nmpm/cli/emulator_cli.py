@@ -23,7 +23,7 @@ from nmpm._support.devices import device_name, find_device
 from nmpm._support.threads import stated_threads
 from nmpm.cli.console import BriefParser, explain, is_of_other_packages
 from nmpm.cli.early_checks import UsageError
-from nmpm.cli.matched_run import MatchedRun, add_arguments
+from nmpm.cli.matched_run import MatchedRun, add_arguments, stored_scene
 from nmpm.cli.options import check_folder
 from nmpm.cli.run_folder import CHECKPOINTS, SAVERS, RunFolder
 from nmpm.data.datamodule import TrajectoryDataModule
@@ -91,14 +91,9 @@ class EmulatorCLI(LightningCLI):
 
     def _model_scene(self, scene: Scene) -> Scene:
         """The data's scene, with fields of the checkpoint under evaluation that the data lack."""
-        if self.subcommand == "fit":
-            return scene
-        try:
-            path = self.checkpoint_path()
-            stored = read_checkpoint(path).get("hyper_parameters", {}).get("scene") if path else None
-        except NmpmError:  # is raised again when the checkpoint is loaded; here the parser would wrap it
-            return scene
-        return scene.with_fields_of(Scene.from_dict(stored)) if isinstance(stored, dict) else scene
+        path = None if self.subcommand == "fit" else self.checkpoint_path()
+        stored = stored_scene(path) if path else None
+        return scene.with_fields_of(stored) if stored else scene
 
     def _parse_ckpt_path(self) -> None:
         """The configuration is the truth: a checkpoint's stored hyperparameters do not silently override it."""

@@ -74,7 +74,7 @@ class MatchedRun:
         if (start is None or config["ckpt_path"]) and checkpoint is None:
             return None
         data = TrajectoryDataModule(**config["data"].as_dict())
-        if checkpoint is not None and not _is_of_another_kind(data.scene, checkpoint):
+        if checkpoint is not None and not ((stored := stored_scene(checkpoint)) and stored.differences(data.scene)):
             return None
         model = load_model(str(start)) if checkpoint is None else load_checkpoint(checkpoint)
         source = data.data_source  # of which nothing is simulated yet
@@ -111,13 +111,13 @@ class MatchedRun:
             config["data"]["reading"] = to_plain(reading) | {"scene": reading.scene.to_dict()}
 
 
-def _is_of_another_kind(scene: Scene, checkpoint: Path) -> bool:
-    """Whether today's rules refuse to evaluate a checkpoint on a scene; not for one that cannot be read."""
+def stored_scene(checkpoint: Path) -> Scene | None:
+    """The scene of a checkpoint's model; None for one that cannot be read, which is refused when it is loaded."""
     try:
         stored = read_checkpoint(checkpoint).get("hyper_parameters", {}).get("scene")
-        return isinstance(stored, dict) and bool(Scene.from_dict(stored).differences(scene))
-    except NmpmError:  # is raised again when the checkpoint is loaded
-        return False
+        return Scene.from_dict(stored) if isinstance(stored, dict) else None
+    except NmpmError:
+        return None
 
 
 def _namespace(plain: Any) -> Any:

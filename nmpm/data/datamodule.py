@@ -76,14 +76,12 @@ class TrajectoryDataModule(LightningDataModule):
         limit_eval: Validate on the first `limit_eval` trajectories only.
         eval_batch_size: Trajectories per evaluation batch, of equal length each.
         generate: Options for the simulation of `name`: `counts` (trajectories per split), `frames`, `seed`, `workers`.
-        reading: How the data are read for a model, as plain data, see the attribute and `nmpm.scene.Reading`.
+        reading: How the data are read for a model, see `nmpm.scene.Reading`, as plain data.
 
     Attributes:
         validated: Trajectories, the first of the valid split, that validations of a training use where `limit_eval`
             does not say it; None before that is decided, and for all. Kept in checkpoints.
-        reading: How the data are read for a model, in whose frames the windows and `horizon` then are: with `every`
-            they begin at any frame of the data, and with `between` count only what the data have. None, the default,
-            for data as they are.
+        reading: The same as a `Reading`; windows and `horizon` are then in the model's frames. None for data as they are.
 
     Raises:
         ConfigError: if neither `path` nor `name` is given, options contradict each other, or a number is not positive.

@@ -95,12 +95,10 @@ class EmulatorModule(EvaluatedModule):
     ) -> None:
         emulator = EmulatorRecipe(scene, **recipe).build()
         super().__init__(emulator, emulator.frames * unroll, metrics)
-        if not 0 <= unroll_growth <= 1:
-            raise ConfigError(f"model.unroll_growth = {unroll_growth} is a share of the training, in [0, 1].")
-        self.unroll, self.unroll_growth = unroll, unroll_growth
-        if not 0 <= gradient_discount <= 1:
-            raise ConfigError(f"model.gradient_discount = {gradient_discount} must be in [0, 1].")
-        self.gradient_discount = gradient_discount
+        for name, share in (("unroll_growth", unroll_growth), ("gradient_discount", gradient_discount)):
+            if not 0 <= share <= 1:
+                raise ConfigError(f"model.{name} = {share} must be in [0, 1], a share.")
+        self.unroll, self.unroll_growth, self.gradient_discount = unroll, unroll_growth, gradient_discount
         self.make_optimizer = optimizer
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
         self.error = TrainingError(density_weight, error_power)
@@ -112,21 +110,12 @@ class EmulatorModule(EvaluatedModule):
         self.record, self._recorded = record, RecordedSteps()
         self.seed = seed
         arguments = emulator.recipe.to_dict() | {
-            "unroll": unroll,
-            "unroll_growth": unroll_growth,
-            "gradient_discount": gradient_discount,
-            "schedule": dataclasses.asdict(self.schedule),
-            "density_weight": density_weight,
-            "field_weight": field_weight,
-            "error_power": error_power,
-            "position_noise": position_noise,
-            "mirror": list(mirror),
-            "jitter": jitter,
-            "recompute": recompute,
-            "compile": compile,
-            "record": record,
+            "unroll": unroll, "unroll_growth": unroll_growth, "gradient_discount": gradient_discount,
+            "schedule": dataclasses.asdict(self.schedule), "density_weight": density_weight,
+            "field_weight": field_weight, "error_power": error_power, "position_noise": position_noise,
+            "mirror": list(mirror), "jitter": jitter, "recompute": recompute, "compile": compile, "record": record,
             "seed": seed,
-        }
+        }  # fmt: skip
         del arguments["format"]  # (of the checkpoint, see on_save_checkpoint)
         self.save_hyperparameters(arguments, logger=False)
         self._clock = Clock()
