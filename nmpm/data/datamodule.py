@@ -81,7 +81,7 @@ class TrajectoryDataModule(LightningDataModule):
     Attributes:
         validated: Trajectories, the first of the valid split, that validations of a training use where `limit_eval`
             does not say it; None before that is decided, and for all. Kept in checkpoints.
-        reading: The same as a `Reading`; windows and `horizon` are then in the model's frames. None for data as they are.
+        reading: The same as a `Reading`, whose frames windows and `horizon` then have; None for data as they are.
 
     Raises:
         ConfigError: if neither `path` nor `name` is given, options contradict each other, or a number is not positive.
