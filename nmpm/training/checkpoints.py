@@ -111,8 +111,8 @@ def check_same_scene(model: Scene, data: Scene) -> None:
     if different:
         facts = "; ".join(f"{name} = {getattr(model, name)}, not {getattr(data, name)}" for name in different)
         raise ConfigError(
-            f"The model was made for other scenes than the data's: {facts}. For another box, or other particles, take"
-            " EmulatorModule.of(emulator.over(data.scene)); what else differs needs a model of its own."
+            f"The model was made for other scenes than the data's: {facts}. Let it take the data: fitted ="
+            " model.fit_to(data); data.reading = fitted.match.reading; EmulatorModule.of(fitted.emulator)."
         )
 
 
