@@ -14,7 +14,7 @@ from nmpm.data import catalog
         ("waterramps", {"solid"}),
         pytest.param("variablegravity", {"solid", "gravity_x", "gravity_y"}, marks=pytest.mark.slow),
         pytest.param("multimaterial", {"water.volume", "sand.volume", "goop.volume"}, marks=pytest.mark.slow),
-        pytest.param("waterdrop3d", {"water.velocity_z"}, marks=pytest.mark.slow),
+        pytest.param("waterramps3d", {"water.velocity_z", "solid"}, marks=pytest.mark.slow),
         pytest.param("universal", {"solid", "gravity_x", "sand.volume"}, marks=pytest.mark.slow),
         ("dambreak2d", {"solid"}),
     ],
