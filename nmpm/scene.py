@@ -279,11 +279,13 @@ class Motion:
         largest: Speed that all but the fastest 0.1% stay below, likewise.
         gravity: In length per second squared; measured where the scene states none, and where it varies each
             component's root mean square. None where it is unknown.
+        frames: Of the shortest trajectory; None where that is unknown.
     """
 
     rms: float
     largest: float
     gravity: tuple[float, ...] | None = None
+    frames: int | None = None
 
 
 def check_field_names(names: Iterable[str]) -> None:

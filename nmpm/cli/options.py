@@ -20,6 +20,8 @@ MODEL = (
     " Face hub, owner/repository@revision"
 )
 """Help for arguments that `nmpm.zoo.load_model` takes."""
+_FACTS = "family types static prescribed bounds dt gravity boundary fields resample smooth".split()
+"""Options of `add_data_options`."""
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
@@ -201,6 +203,12 @@ def data_options(options: argparse.Namespace) -> Options:
         resample=options.resample,
         smooth=options.smooth,
     )
+
+
+def stated_facts(options: argparse.Namespace) -> list[str]:
+    """The options of `add_data_options` that were given, with their values, as words of a command."""
+    values = {name: getattr(options, name) for name in _FACTS}
+    return [f"--{name}={value}" for name, value in values.items() if value is not None]
 
 
 def gravity_option(text: str | None) -> tuple[float, ...] | None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nmpm.cli.match_options import MatchOptions, add_reading_options
-from nmpm.cli.options import check_exists
+from nmpm.cli.options import add_data_options, check_exists, data_options, derived_name, stated_facts
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -23,6 +23,7 @@ EXAMPLES = """\
 examples:
   nmpm zoo match grains
   nmpm zoo match grains.npz --materials big=sand,small=sand
+  nmpm zoo match waterdrop --family deepmind --gravity 0,-9.81
 """
 
 
@@ -34,12 +35,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("data", type=Path, help="a dataset, of any format that nmpm convert reads")
     add_reading_options(parser)
+    add_data_options(parser)
 
 
 def match(options: argparse.Namespace) -> None:
     """Print the ranking, and the commands that go on with the best model."""
     check_exists("DATA", options.data)
-    stated = MatchOptions.read(options.materials, options.stride)
+    stated, facts = MatchOptions.read(options.materials, options.stride), data_options(options)
     from rich.console import Console
 
     from nmpm._support.progress import progress_bar
@@ -48,14 +50,14 @@ def match(options: argparse.Namespace) -> None:
     from nmpm.zoo.ranking import Ranking, Trial
     from nmpm.zoo.registry import Zoo, load_model
 
-    trial = Trial.of(Dataset(FolderSource(options.data)))
+    trial = Trial.of(Dataset(FolderSource(options.data, facts)))
     names = Zoo.list(options.root)
     loaders = {name: (lambda name=name: load_model(name, root=options.root).emulator) for name in names}
     with progress_bar("models", len(names)) as step:
         standings = Ranking(trial, stated.materials, stated.stride).rank(loaders, step)
     Console().print(_table(trial, standings))
     best = next((one for one in standings if one.match is not None and math.isfinite(one.error)), None)
-    sys.stdout.write("".join(f"{line}\n" for line in _advice(options, trial, best)))
+    sys.stdout.write("".join(f"{line}\n" for line in _advice(options, best)))
 
 
 def _table(trial: Trial, standings: Sequence[Standing]) -> Table:
@@ -98,20 +100,22 @@ def _row(one: Standing) -> list[str]:
     ]
 
 
-def _advice(options: argparse.Namespace, trial: Trial, best: Standing | None) -> list[str]:
+def _advice(options: argparse.Namespace, best: Standing | None) -> list[str]:
     """What could not be matched of the best model, and the commands that use it."""
     if best is None or best.match is None:
         return ["No model takes these data: nmpm init writes a configuration for a training from nothing."]
     lines = [f"warning: {warning}" for warning in best.match.warnings]
     if best.error >= 1:
         lines.append("No model is better than a trivial predictor; a fine-tuning may be.")
-    materials = {name: best.match.reading.materials.get(name, name) for name in trial.scene.materials}
-    renamed = ["--materials", ",".join(f"{name}={theirs}" for name, theirs in materials.items() if name != theirs)]
+    materials = ",".join(f"{name}={theirs}" for name, theirs in (best.stated or {}).items())
     stated = [
-        *(renamed if best.match.reading.materials else []),
+        *(["--materials", materials] if materials else []),
         *(["--stride", options.stride] if options.stride else []),
     ]
-    data = str(options.data)
+    facts = stated_facts(options)
+    data = derived_name(options.data, "").name + "-stated" if facts else str(options.data)
+    if facts:
+        lines.append(f"first state it:   {shlex.join(['nmpm', 'convert', str(options.data), data, *facts])}")
     rollout, fit = ["rollout", best.model, "--data", data], ["fit", "--start_from", best.model, "--data.path", data]
     lines += [f"as it is:         {shlex.join(['nmpm', *rollout, *stated])}"]
     return [*lines, f"to start from it: {shlex.join(['nmpm', *fit, *stated])}"]

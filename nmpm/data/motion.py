@@ -28,6 +28,7 @@ def measure_motion(folder: Path, metadata: Metadata) -> Motion:
         rms=float(np.sqrt(np.square(speeds).mean())),
         largest=float(np.quantile(speeds, _QUANTILE)),
         gravity=_gravity(split, indices, metadata),
+        frames=min(split.frames(index) for index in range(len(split))),
     )
 
 

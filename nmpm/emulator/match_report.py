@@ -9,7 +9,7 @@ from fractions import Fraction
 
 from nmpm.emulator.experience import Experience, Figures, clamp, mean_width
 from nmpm.emulator.recipe import EmulatorRecipe
-from nmpm.scene import Scene
+from nmpm.scene import Boundary, Scene
 
 FACTOR = 1.25
 """Left-over factors of gravity beyond which there is a warning."""
@@ -84,7 +84,9 @@ class MatchReport:
         data, model = self.figures.gravity, self.seen.gravity
         told = model and self.model.scene.gravity_varies
         theirs = f"{model[0]:.3g} to {model[1]:.3g}" if model and told else _number(model and model[1])
-        both = f"{_number(data)} cells/frame²{' as measured' if self.measured else ''} (model {theirs})"
+        none = "none" if self.scene.gravity_known else "unknown"
+        measured = " as measured" if self.measured else ""
+        both = f"{f'{data:.3g} cells/frame²' if data else none}{measured} (model {theirs})"
         if data and model:
             return f"{both}, factor {self.seen.motion_factor(self.figures):.3g}"
         if self.figures.rms and self.seen.rms:
@@ -146,9 +148,12 @@ class MatchReport:
 
     def _boundary_warnings(self) -> Iterator[str]:
         (model, data), mine, theirs = self.names, self.model.scene, self.scene
-        for axis, (one, other) in enumerate(zip(mine.boundary, theirs.boundary, strict=True)):
+        axes: dict[tuple[Boundary, Boundary], list[str]] = {}
+        for axis, pair in zip("xyz", zip(mine.boundary, theirs.boundary, strict=True), strict=False):
+            axes.setdefault(pair, []).append(axis)
+        for (one, other), names in axes.items():
             if one != other:
-                yield f"Along {'xyz'[axis]} {data} has the boundary {other!r}, {model} was trained with {one!r}."
+                yield f"Along {', '.join(names)} {data} has the boundary {other!r}, {model} was trained with {one!r}."
         if theirs.obstacles and not mine.walled:
             yield f"{data} has obstacles, which the network of {model} does not see."
         if theirs.moving_obstacles and not mine.moving_obstacles:

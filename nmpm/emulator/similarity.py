@@ -95,7 +95,8 @@ def find_match(
         scene = dataclasses.replace(scene, gravity=motion.gravity)
     mapping = match_materials(emulator.scene.materials, scene.materials, materials or {}, names)
     search = _Search(emulator, _with_channels_of(emulator.scene, scene), motion, Experience.of(emulator))
-    recipe, chosen_stride = search.same_units(stride) or search.best(STRIDES if stride is None else (stride,), names)
+    strides = search.strides if stride is None else (stride,)
+    recipe, chosen_stride = search.same_units(stride) or search.best(strides, names)
     figures = Figures.of(scene, motion, recipe.grid.spacing, chosen_stride)
     report = MatchReport(emulator.recipe, recipe, scene, chosen_stride, search.seen, figures, measured, names)
     warnings = tuple(report.warnings())
@@ -137,6 +138,13 @@ class _Search:
     scene: Scene
     motion: Motion | None
     seen: Experience
+
+    @property
+    def strides(self) -> tuple[Fraction, ...]:
+        """Those of `STRIDES` with which trajectories are long enough for a start and a bundle of the model's frames."""
+        frames = self.motion.frames if self.motion else None
+        most = max(1, (frames - 1) // (self.emulator.frames + 1)) if frames else max(STRIDES)
+        return tuple(stride for stride in STRIDES if stride <= most)
 
     def same_units(self, stride: Fraction | None) -> tuple[EmulatorRecipe, Fraction] | None:
         """The model's cells for a scene in its units, with its time step and gravity that it knows; None for others."""

@@ -28,6 +28,7 @@ def test_speeds_are_per_frame_and_gravity_is_measured_where_none_is_stated(tmp_p
     assert motion.rms == pytest.approx(np.sqrt((speeds**2).mean()), rel=0.05)
     assert motion.largest == pytest.approx(speeds[-1], rel=0.01)
     assert motion.gravity == pytest.approx((0.0, -9.81), rel=0.02)
+    assert motion.frames == 20
 
 
 def test_of_trajectories_that_differ_in_gravity_it_is_the_root_mean_square(make_dataset):

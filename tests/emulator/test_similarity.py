@@ -115,14 +115,23 @@ def test_without_gravity_speeds_decide():
     assert "by speeds" in match.lines[2]
 
 
+def test_the_model_jumps_over_no_more_frames_than_leave_enough_of_a_trajectory():
+    emulator = model_of(box(gravity=None))
+    scene = in_other_units(emulator.scene)
+    width, bundle = 250 * emulator.grid.spacing[0], emulator.frames
+    slow = {frames: Motion(1e-3 * width, 2e-3 * width, frames=frames) for frames in (3, 2 * bundle + 3, 1000)}
+    every = [find_match(emulator, scene, motion).reading.every for motion in slow.values()]
+    assert every == [1, 2, 20]
+
+
 def test_a_rougher_match_is_a_warning_with_its_factor_and_strictly_refused():
     emulator = model_of()
-    scene = in_other_units(emulator.scene, gravity=(0.0, -0.8), boundary=("open", "wall"))
+    scene = in_other_units(emulator.scene, gravity=(0.0, -0.8), boundary=("open", "open"))
     match = find_match(emulator, scene, stride=Fraction(1), names=("goop", "slime"))
     gravity, boundary = match.warnings
     assert "slime is 0.0" in gravity
     assert "times that of goop" in gravity
-    assert boundary == "Along x slime has the boundary 'open', goop was trained with 'wall'."
+    assert boundary == "Along x, y slime has the boundary 'open', goop was trained with 'wall'."
     with pytest.raises(ConfigError, match="times that of goop"):
         find_match(emulator, scene, stride=Fraction(1), strict=True, names=("goop", "slime"))
 
