@@ -20,7 +20,10 @@ MODEL = (
     " Face hub, owner/repository@revision"
 )
 """Help for arguments that `nmpm.zoo.load_model` takes."""
-_FACTS = "family types static prescribed bounds dt gravity boundary fields resample smooth".split()
+_FACTS = (
+    *("family", "types", "static", "prescribed", "bounds", "dt"),
+    *("gravity", "boundary", "fields", "resample", "smooth"),
+)
 """Options of `add_data_options`."""
 
 
