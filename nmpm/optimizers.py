@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -121,8 +120,7 @@ class _RecordedMoves:
         try:
             self._replay, _ = cuda_graph.record(self._compute, weights[0].device)
         except Exception as failure:  # (of whatever an operation raises that cannot be recorded)
-            reason = (str(failure).splitlines() or [type(failure).__name__])[0][:200]
-            warnings.warn(f"Steps of SOAP are not recorded as CUDA graphs: {reason}", stacklevel=4)
+            cuda_graph.warn_not_recorded("Steps of SOAP", failure)
             self._replay = self._compute
         torch._foreach_copy_(changing, before)  # recording has called it several times
 

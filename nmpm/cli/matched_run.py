@@ -16,8 +16,6 @@ from nmpm._support.plain_data import to_plain
 from nmpm.cli.early_checks import read_options, stated_keys
 from nmpm.cli.match_options import MATERIALS, STRICT, STRIDE, MatchOptions, describe
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.data.dataset import Dataset
-from nmpm.data.loading.sources import FolderSource
 from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.similarity import Match
 from nmpm.errors import ConfigError, NmpmError
@@ -77,11 +75,7 @@ class MatchedRun:
         if checkpoint is not None and not ((stored := stored_scene(checkpoint)) and stored.differences(data.scene)):
             return None
         model = load_model(str(start)) if checkpoint is None else load_checkpoint(checkpoint)
-        source = data.data_source  # of which nothing is simulated yet
-        described = Dataset(source) if isinstance(source, FolderSource) else source.scene
-        match = match_data(
-            model, described, *MatchOptions.read(config["materials"], config["stride"], config["strict"])
-        )
+        match = match_data(model, data, *MatchOptions.read(config["materials"], config["stride"], config["strict"]))
         different = tuple(key for key in FORM if _differs(config["model"][key], match.recipe, key))
         stated = stated_keys(read_options(sys.argv[2:]), "model") if checkpoint is None else set()
         return cls(model.matched(match), match, data.scene, different, tuple(k for k in different if k in stated))

@@ -95,15 +95,16 @@ def find_match(
         scene = dataclasses.replace(scene, gravity=motion.gravity)
     mapping = match_materials(emulator.scene.materials, scene.materials, materials or {}, names)
     search = _Search(emulator, _with_channels_of(emulator.scene, scene), motion, Experience.of(emulator))
+    same = search.same_units() if stride in (None, 1) else None
     strides = search.strides if stride is None else (stride,)
-    recipe, chosen_stride = search.same_units(stride) or search.best(strides, names)
-    figures = Figures.of(scene, motion, recipe.grid.spacing, chosen_stride)
-    report = MatchReport(emulator.recipe, recipe, scene, chosen_stride, search.seen, figures, measured, names)
+    recipe, step = search.best(strides, names) if same is None else (same, Fraction(1))
+    figures = Figures.of(scene, motion, recipe.grid.spacing, step)
+    report = MatchReport(emulator.recipe, recipe, scene, step, search.seen, figures, measured, names)
     warnings = tuple(report.warnings())
     if strict and warnings:
         raise ConfigError(f"{' '.join(warnings)} Without strict these are warnings.")
     differing = {name: to for name, to in mapping.names.items() if to != name}
-    reading = Reading(recipe.scene, differing, chosen_stride.numerator, chosen_stride.denominator)
+    reading = Reading(recipe.scene, differing, step.numerator, step.denominator)
     bodies = "; obstacles -> solid channel" if scene.obstacles else ""
     pulls = [gravity_in_cells(of.scene.gravity, of.scene.dt, of.grid.spacing) for of in (recipe, emulator.recipe)]
     factor = pulls[0] / pulls[1] if pulls[0] and pulls[1] else None
@@ -146,10 +147,10 @@ class _Search:
         most = max(1, (frames - 1) // (self.emulator.frames + 1)) if frames else max(STRIDES)
         return tuple(stride for stride in STRIDES if stride <= most)
 
-    def same_units(self, stride: Fraction | None) -> tuple[EmulatorRecipe, Fraction] | None:
+    def same_units(self) -> EmulatorRecipe | None:
         """The model's cells for a scene in its units, with its time step and gravity that it knows; None for others."""
         apart = self.scene.particle_spacing / self.emulator.scene.particle_spacing
-        if stride not in (None, 1) or not 1 / _SAME_UNITS < apart < _SAME_UNITS:
+        if not 1 / _SAME_UNITS < apart < _SAME_UNITS:
             return None
         try:
             recipe = self.emulator.recipe.over(self.scene)
@@ -157,9 +158,8 @@ class _Search:
             return None
         figures = Figures.of(self.scene, self.motion, recipe.grid.spacing, Fraction(1))
         (fewest, most), seen = self.seen.spacings, math.isclose(self.seen.motion_factor(figures), 1.0)
-        if recipe.scene.gravity_varies and not (seen and fewest <= figures.spacing <= most):
-            return None
-        return recipe, Fraction(1)
+        known = not recipe.scene.gravity_varies or (seen and fewest <= figures.spacing <= most)
+        return recipe if known else None
 
     def best(self, strides: Sequence[Fraction], names: tuple[str, str]) -> tuple[EmulatorRecipe, Fraction]:
         """The form of the model, and the stride, of the least cost.

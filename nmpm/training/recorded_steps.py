@@ -9,7 +9,6 @@ optimizer stay outside.
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -79,8 +78,7 @@ class RecordedSteps:
                     self._pool = torch.cuda.graph_pool_handle()
                 self._steps[key] = _RecordedStep(error, emulator, window, inputs, self._pool)
             except Exception as failure:  # (of whatever an operation raises that cannot be recorded)
-                reason = (str(failure).splitlines() or [type(failure).__name__])[0][:200]
-                warnings.warn(f"Training steps are not recorded as CUDA graphs: {reason}", stacklevel=4)
+                cuda_graph.warn_not_recorded("Training steps", failure)
                 self._failed = True
                 self._steps.clear()
         return self._steps.get(key)

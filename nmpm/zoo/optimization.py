@@ -6,6 +6,7 @@ import dataclasses
 import logging
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -16,6 +17,9 @@ from nmpm.emulator.runtimes import RUNTIMES, Eager, Runtime, check_runtime
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 
+if TYPE_CHECKING:
+    from nmpm.zoo.pretrained import Pretrained
+
 AUTO = "auto"
 """Stands for the fastest of `RUNTIMES` that can run the model here, as measured."""
 TOLERANCE = 1e-3
@@ -23,6 +27,15 @@ TOLERANCE = 1e-3
 _SPEED = 0.2  # cells per frame, of the particles of the example: at rest, the network would have little to say
 _BUNDLES, _ROUNDS = 4, 3  # of the rollouts that are timed
 _LOG = logging.getLogger(__name__)
+
+
+def fitting_count(model: Pretrained, count: int, blocks: int | None = None) -> int:
+    """The number of particles, halved until an example of so many blocks fits into a model's box."""
+    try:
+        model.example(count=count, blocks=blocks)
+    except ConfigError:
+        return fitting_count(model, count // 2, blocks) if count > 1 else count
+    return count
 
 
 def optimize(emulator: Emulator, runtime: str | Runtime, make_example: Callable[[], Particles]) -> Emulator:

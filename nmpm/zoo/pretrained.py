@@ -37,7 +37,7 @@ from nmpm.particles import Particles
 from nmpm.scene import Scene
 from nmpm.zoo.card import preset_of
 from nmpm.zoo.matching import match_data
-from nmpm.zoo.optimization import AUTO, optimize
+from nmpm.zoo.optimization import AUTO, fitting_count, optimize
 from nmpm.zoo.starts import state_of
 from nmpm.zoo.states import TOO_FAST, Bodies, StateBuilder
 
@@ -251,20 +251,9 @@ class Pretrained:
         model = self if precision is None else self.with_network(precision)
 
         def make_example() -> Particles:
-            return model.example(count=model.fitting_count(_EXAMPLE)).to(model.emulator.device)
+            return model.example(count=fitting_count(model, _EXAMPLE)).to(model.emulator.device)
 
         return dataclasses.replace(model, emulator=optimize(model.emulator, runtime, make_example))
-
-    def fitting_count(self, count: int, blocks: int | None = None) -> int:
-        """The number of particles, halved until an example of so many blocks fits into the box."""
-        while count > 1:
-            try:
-                self.example(count=count, blocks=blocks)
-            except ConfigError:
-                count //= 2
-            else:
-                break
-        return count
 
     def to(self, device: torch.device | str) -> Pretrained:
         """The model on another device: "cpu", "cuda", "cuda:1", "mps", or "auto" for a GPU where there is one.

@@ -25,6 +25,7 @@ from nmpm.evaluation.bootstrap import interval
 from nmpm.metrics import MSE
 from nmpm.zoo.entries import Rows, load_entry, read_scenes
 from nmpm.zoo.measures.scenes import iterate_test_scenes
+from nmpm.zoo.optimization import fitting_count
 from nmpm.zoo.pretrained import Pretrained
 
 FRAMES, COUNT, PROBES, SEEDS = 32, 300, 8, 8
@@ -142,7 +143,7 @@ def golden_rollout(emulator: Emulator) -> dict[str, Any]:
     Of the first scenes it is the one that deforms the block most: what flies freely would hardly show that a network's
     output has changed.
     """
-    count = Pretrained(emulator, {}).fitting_count(COUNT, blocks=1)
+    count = fitting_count(Pretrained(emulator, {}), COUNT, blocks=1)
     paths = [_positions(emulator, seed, count, FRAMES) for seed in range(SEEDS)]
     deformation = []
     for seed, last in enumerate(paths):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import warnings
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
@@ -132,6 +133,12 @@ class Recorded:
         self._replay()
         made = self._bundle
         return dataclasses.replace(made, position=made.position.clone(), velocity=made.velocity.clone())
+
+
+def warn_not_recorded(what: str, failure: Exception) -> None:
+    """Warn that something is not recorded, of whatever an operation raises that cannot be."""
+    reason = (str(failure).splitlines() or [type(failure).__name__])[0][:200]
+    warnings.warn(f"{what} are not recorded as CUDA graphs: {reason}", stacklevel=5)
 
 
 def record(function: Callable[[], T], device: torch.device, pool: Any = None) -> tuple[Callable[[], None], T]:
