@@ -58,13 +58,12 @@ class Comparison(nn.Module):
         scene: Gives gravity and walls for the free fall.
         metrics: What to compute, an `MSE` among them; copied, so that one list serves several comparisons.
         bundle: Frames that the model predicts at once: particles that enter count from the start of the next bundle on.
-        every: Frames of the data per frame of the model, where it skips some: horizons count frames of the data.
 
     Raises:
         ConfigError: if there is not exactly one `MSE`, by which checkpoints are chosen.
     """
 
-    def __init__(self, scene: Scene, metrics: Sequence[RolloutMetric], bundle: int = 1, every: int = 1) -> None:
+    def __init__(self, scene: Scene, metrics: Sequence[RolloutMetric], bundle: int = 1) -> None:
         super().__init__()
         if sum(isinstance(metric, MSE) for metric in metrics) != 1:
             raise ConfigError("model.metrics needs nmpm.metrics.MSE once: the best checkpoint is chosen by it.")
@@ -76,10 +75,9 @@ class Comparison(nn.Module):
                 for kind in PREDICTORS
             }
         )
-        self.count_every(every)
 
     def count_every(self, every: int) -> None:
-        """Count so many frames of the data per frame of the model from now on."""
+        """Let horizons count frames of the data, so many per frame of the model; 1 before it is called."""
         for metric in self.errors.values():
             metric.every = every
 
