@@ -174,16 +174,6 @@ class Scene:
         rates = (f"{m}.{f}" for m in self.materials for f in self.evolving)
         return (*self.input_channels[: self.dim * len(self.materials)], *rates)
 
-    def material_index(self, name: str) -> int:
-        """Channel position of a material.
-
-        Raises:
-            ConfigError: if the scene has no such material.
-        """
-        if name not in self.materials:
-            raise ConfigError(f"Material {name!r} is unknown to this scene, which has {', '.join(self.materials)}.")
-        return self.materials.index(name)
-
     def differences(self, other: Scene) -> tuple[str, ...]:
         """Names of the facts that differ between a model's scene and its data's, and may not.
 

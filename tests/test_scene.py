@@ -77,8 +77,6 @@ def test_contradictions_are_named(changes, complaint):
         dataclasses.replace(BOX, **changes)
 
 
-def test_unknown_keys_and_materials_are_named():
+def test_unknown_keys_are_named():
     with pytest.raises(ConfigError, match="colour"):
         Scene.from_dict(BOX.to_dict() | {"colour": "red"})
-    with pytest.raises(ConfigError, match=r"'lava'.*goop"):
-        BOX.material_index("lava")

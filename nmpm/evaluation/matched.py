@@ -79,8 +79,8 @@ class MatchedPredictor:
         ratio, gravity = self.reading.every / self.reading.between, self._gravity(particles)
         unknown = torch.full_like(particles.velocity, torch.nan)
         velocity = model_velocity(particles.velocity, unknown, gravity.unsqueeze(1), ratio)
-        names, theirs = self.reading.materials, self.reading.scene
-        index = torch.tensor([theirs.material_index(names.get(name, name)) for name in self.scene.materials])
+        names, theirs = self.reading.materials, self.reading.scene.materials
+        index = torch.tensor([theirs.index(names.get(name, name)) for name in self.scene.materials])
         last = particles.obstacle_velocity
         return dataclasses.replace(
             particles,

@@ -166,7 +166,7 @@ class RecordingReader:
                     f"{where}: the material {name!r} (type {type_id}) is not in the scene, which has"
                     f" {', '.join(self.scene.materials)}. Remove the trajectory, or train on data that has both."
                 )
-            index[types == type_id] = self.scene.material_index(name)
+            index[types == type_id] = self.scene.materials.index(name)
         return index
 
 
