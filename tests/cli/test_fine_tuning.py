@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from nmpm import TrajectoryDataModule
 from nmpm.cli import main
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.zoo import Zoo
@@ -35,12 +36,12 @@ PATIENT = {"class_path": "lightning.pytorch.callbacks.EarlyStopping"}
 def fit(make_dataset, tmp_path, monkeypatch):
     """Runs `nmpm fit` on made-up data with a learning rate and further words."""
     monkeypatch.chdir(tmp_path)
-    data = make_dataset(train=((30, 9),) * 2, valid=((30, 9),), test=((30, 9),))
+    make_dataset(train=((30, 9),) * 2, valid=((30, 9),), test=((30, 9),)).rename(tmp_path / "data")
     Path("tiny.yaml").write_text(TINY)
 
     def fit(folder: str, steps: int, rate: float, *words: str) -> dict:
         optimizer = ["--model.optimizer", "torch.optim.SGD", "--model.optimizer.init_args.lr", str(rate)]
-        given = ["--data.path", str(data), "--trainer.max_steps", str(steps), "--trainer.default_root_dir", folder]
+        given = ["--data.path", "data", "--trainer.max_steps", str(steps), "--trainer.default_root_dir", folder]
         assert main(["fit", "--config", "tiny.yaml", *optimizer, *given, *words]) == 0
         return json.loads(Path(folder, "report.json").read_text())
 
@@ -75,6 +76,17 @@ def test_a_training_that_makes_it_better_says_by_how_much(fit):
     assert report["progress"] == (
         f"valid/overall = {errors[0]:.3g} at the start, {errors[best]:.3g} after {best} of 3 steps, the best."
     )
+
+
+def test_before_the_first_step_it_predicts_what_the_model_does(fit):
+    report = fit("worse", 1, 1e-30, "--start_from", "goop")
+    assert "None of the validations" in report["progress"]
+    model, data = Zoo.load("goop").fit_to("data"), TrajectoryDataModule(path="data")
+    data.reading = model.match.reading
+    (window,) = data.test_dataloader()
+    predicted = model.rollout(window.initial, window.target.shape[1])
+    assert report["test"]["mse"] == pytest.approx(float((predicted - window.target).square().mean()), rel=1e-5)
+    assert same(model.emulator.state_dict(), weights_of("worse"))
 
 
 def test_early_stopping_counts_from_the_start(fit):
