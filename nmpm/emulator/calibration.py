@@ -90,7 +90,7 @@ def unread_inputs(emulator: Emulator) -> list[int]:
     if layers is None:
         return []
     count = len(emulator.scene.input_channels)
-    weight = emulator.processor.get_submodule(layers.first).weight  # (may be parametrised)
+    weight: Tensor = emulator.processor.get_submodule(layers.first).weight  # type: ignore[assignment]  # (parametrised, too)
     reads = weight[:, : count * layers.cells].unflatten(1, (count, layers.cells)).movedim(1, 0).flatten(1)
     return [index for index, silent in enumerate((reads == 0).all(1).tolist()) if silent]
 
