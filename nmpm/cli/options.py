@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
@@ -20,11 +21,6 @@ MODEL = (
     " Face hub, owner/repository@revision"
 )
 """Help for arguments that `nmpm.zoo.load_model` takes."""
-_FACTS = (
-    *("family", "types", "static", "prescribed", "bounds", "dt"),
-    *("gravity", "boundary", "fields", "resample", "smooth"),
-)
-"""Options of `add_data_options`."""
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
@@ -210,7 +206,9 @@ def data_options(options: argparse.Namespace) -> Options:
 
 def stated_facts(options: argparse.Namespace) -> list[str]:
     """The options of `add_data_options` that were given, with their values, as words of a command."""
-    values = {name: getattr(options, name) for name in _FACTS}
+    from nmpm.data.convert import Options
+
+    values = {field.name: getattr(options, field.name) for field in dataclasses.fields(Options)}
     return [f"--{name}={value}" for name, value in values.items() if value is not None]
 
 
