@@ -114,7 +114,7 @@ def test_data_that_do_not_suit_the_model_are_refused(make_dataset, tmp_path):
         model = EmulatorModule(
             dataclasses.replace(data.scene, obstacles=not data.scene.obstacles), cells=8, processor=TINY
         )
-        with pytest.raises(ConfigError, match=r"obstacles = (True|False), not (True|False).*over\(data.scene\)"):
+        with pytest.raises(ConfigError, match=r"obstacles = (True|False), not (True|False).*fit_to\(data\)"):
             getattr(trainer_of(tmp_path, 1), stage)(model, data)
     with pytest.raises(ConfigError, match=r"data\.horizon = 4 .* 6 frames .*frames = 2 .*unroll = 3"):
         trainer_of(tmp_path, 1).fit(module_of(data, unroll=3), data)
