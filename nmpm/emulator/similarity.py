@@ -95,9 +95,9 @@ def find_match(
         scene = dataclasses.replace(scene, gravity=motion.gravity)
     mapping = match_materials(emulator.scene.materials, scene.materials, materials or {}, names)
     search = _Search(emulator, _with_channels_of(emulator.scene, scene), motion, Experience.of(emulator))
-    same = search.same_units() if stride in (None, 1) else None
+    same = search.same_data() or search.same_units()
     strides = search.strides if stride is None else (stride,)
-    recipe, step = search.best(strides, names) if same is None else (same, Fraction(1))
+    recipe, step = same if same and stride in (None, same[1]) else search.best(strides, names)
     figures = Figures.of(scene, motion, recipe.grid.spacing, step)
     report = MatchReport(emulator.recipe, recipe, scene, step, search.seen, figures, measured, names)
     warnings = tuple(report.warnings())
@@ -147,7 +147,24 @@ class _Search:
         most = max(1, (frames - 1) // (self.emulator.frames + 1)) if frames else max(STRIDES)
         return tuple(stride for stride in STRIDES if stride <= most)
 
-    def same_units(self) -> EmulatorRecipe | None:
+    def same_data(self) -> tuple[EmulatorRecipe, Fraction] | None:
+        """The model's form and stride for recordings such as it was fine-tuned on; None for others."""
+        mine, theirs = self.emulator.scene, self.scene
+        stride = Fraction(mine.dt / theirs.dt).limit_denominator(max(_WHOLE))
+        same = (mine.bounds, mine.gravity, mine.particle_volume) == (
+            theirs.bounds,
+            theirs.gravity,
+            theirs.particle_volume,
+        )
+        whole = 1 in (stride.numerator, stride.denominator) and math.isclose(float(stride) * theirs.dt, mine.dt)
+        if self.motion is None or not (same and whole and mine.boundary == theirs.boundary):
+            return None
+        scene = dataclasses.replace(
+            theirs, domain=mine.domain, dt=mine.dt, obstacles=theirs.obstacles or mine.obstacles
+        )
+        return dataclasses.replace(self.emulator.recipe, scene=scene), stride
+
+    def same_units(self) -> tuple[EmulatorRecipe, Fraction] | None:
         """The model's cells for a scene in its units, with its time step and gravity that it knows; None for others."""
         apart = self.scene.particle_spacing / self.emulator.scene.particle_spacing
         if not 1 / _SAME_UNITS < apart < _SAME_UNITS:
@@ -159,7 +176,7 @@ class _Search:
         figures = Figures.of(self.scene, self.motion, recipe.grid.spacing, Fraction(1))
         (fewest, most), seen = self.seen.spacings, math.isclose(self.seen.motion_factor(figures), 1.0)
         known = not recipe.scene.gravity_varies or (seen and fewest <= figures.spacing <= most)
-        return recipe if known else None
+        return (recipe, Fraction(1)) if known else None
 
     def best(self, strides: Sequence[Fraction], names: tuple[str, str]) -> tuple[EmulatorRecipe, Fraction]:
         """The form of the model, and the stride, of the least cost.

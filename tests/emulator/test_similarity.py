@@ -51,6 +51,16 @@ def test_a_scene_of_the_model_keeps_its_recipe():
     assert (match.reading.every, match.reading.between) == (1, 1)
 
 
+@pytest.mark.parametrize("frames", [Fraction(1, 3), Fraction(1), Fraction(2)], ids=str)
+def test_a_fine_tuned_model_takes_its_data_as_in_its_training(frames):
+    emulator, motion = model_of(), Motion(0.1, 0.2)
+    scene = in_other_units(emulator.scene, materials=("gel",), domain=((-6.0, 259.0), (-12.0, 250.0)))
+    tuned = emulator.matched(find_match(emulator, scene, motion, stride=frames))
+    again = find_match(tuned, scene, motion)
+    assert again.recipe == tuned.recipe
+    assert Fraction(again.reading.every, again.reading.between) == frames
+
+
 def test_a_model_that_is_told_gravity_keeps_its_cells_where_it_knows_the_gravity():
     emulator = model_of(box(gravity=None, gravity_varies=True))
     usual = find_match(emulator, box(gravity=(0.0, -9.81)))
