@@ -1,7 +1,6 @@
 """Sweeps and the choices that they make: what these predict, and which are left out or refused."""
 
 import dataclasses
-from functools import partial
 from importlib.util import find_spec
 
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 import torch
 
 from nmpm._support.digests import short_digest
-from nmpm.emulator.similarity import find_match
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.trade import (
     Kind,
@@ -113,7 +111,7 @@ def test_a_model_of_another_gravity_takes_the_scenes_at_a_stride_and_says_so_or_
     assert dict(model.identity)["reading"]["every"] == 2
     far = tiny_emulator(dataclasses.replace(scenes.scene, gravity=tuple(-g for g in gravity)))
     with pytest.raises(ConfigError, match=r"model far cannot predict the scenes of .* turn the data"):
-        make_choices(tiny_sweep(), scenes, {"far": far}, find=partial(find_match, strict=True))
+        make_choices(tiny_sweep(), scenes, {"far": far}, strict=True)
 
 
 def test_runtimes_are_choices_of_their_own(scenes):
