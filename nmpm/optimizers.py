@@ -17,9 +17,6 @@ from nmpm.errors import ConfigError
 class SOAP(pytorch_optimizer.SOAP):
     """Adam in the eigenbasis of Shampoo's preconditioner, by `pytorch_optimizer`, with defaults for grid networks.
 
-    On a CUDA GPU the operations of a step, some 25 for each weight, are recorded as a CUDA graph, but for changes of
-    basis.
-
     Source: N. Vyas et al., SOAP: Improving and Stabilizing Shampoo using Adam, arXiv 2409.11321. Compared with Adam
     in `docs/recipes.md`.
 
@@ -29,6 +26,8 @@ class SOAP(pytorch_optimizer.SOAP):
         weight_decay: Decoupled, as in AdamW.
         max_precondition_dim: Axes of weights that are longer keep their own basis.
         precondition_frequency: Steps between changes of basis.
+        record: Whether a CUDA GPU records the operations of a step, some 25 for each weight, as a CUDA graph, but for
+            changes of basis. Not tried on one yet.
 
     Raises:
         ConfigError: if the learning rate is not positive, or weights are complex.
@@ -36,7 +35,7 @@ class SOAP(pytorch_optimizer.SOAP):
 
     def __init__(
         self, params: Iterable[Tensor], lr: float = 3e-3, weight_decay: float = 0.01, max_precondition_dim: int = 600,
-        precondition_frequency: int = 10,
+        precondition_frequency: int = 10, record: bool = False,
     ) -> None:  # fmt: skip
         if not lr > 0:
             raise ConfigError(f"SOAP: lr = {lr} must be a positive number.")
@@ -50,6 +49,7 @@ class SOAP(pytorch_optimizer.SOAP):
             weights, lr=lr, weight_decay=weight_decay, max_precondition_dim=max_precondition_dim,
             precondition_frequency=precondition_frequency,
         )  # fmt: skip
+        self.defaults["record"] = record  # (which copies keep)
         self._moves: dict[int, _RecordedMoves] = {}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -59,7 +59,7 @@ class SOAP(pytorch_optimizer.SOAP):
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
         """As `pytorch_optimizer`'s, to the same bits."""
-        if not all(map(_can_record, self.param_groups)):
+        if not (self.defaults["record"] and all(map(_can_record, self.param_groups))):
             return super().step(closure)
         loss = None
         if closure is not None:

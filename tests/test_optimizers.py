@@ -44,11 +44,11 @@ def test_recorded_steps_move_weights_as_others_do(monkeypatch, device, frequency
         generator = torch.Generator().manual_seed(0)
         shapes = ((4, 3, 3, 3), (4,), (5, 7))
         weights = [torch.nn.Parameter(torch.randn(shape, generator=generator).to(device)) for shape in shapes]
-        optimizer = SOAP(weights, lr=0.01, precondition_frequency=frequency)
+        optimizer = SOAP(weights, lr=0.01, precondition_frequency=frequency, record=True)
         for step in range(14):
             if step == resume_at:
                 state = copy.deepcopy(optimizer.state_dict())
-                optimizer = SOAP(weights, lr=0.5, precondition_frequency=frequency)
+                optimizer = SOAP(weights, lr=0.5, precondition_frequency=frequency, record=True)
                 optimizer.load_state_dict(state)
             for weight in weights:
                 weight.grad = torch.randn(weight.shape, generator=generator).to(device)
@@ -78,7 +78,7 @@ def test_recorded_steps_move_weights_as_others_do(monkeypatch, device, frequency
 
 def test_steps_that_cannot_be_recorded_are_computed_with_one_warning(monkeypatch):
     weight = torch.nn.Parameter(torch.ones(3, 3))
-    optimizer = SOAP([weight])
+    optimizer = SOAP([weight], record=True)
     monkeypatch.setattr(optimizers, "is_on_gpu", lambda _: True)
     monkeypatch.setattr(cuda_graph, "record", lambda *_: 1 / 0)
     weight.grad = torch.eye(3)
