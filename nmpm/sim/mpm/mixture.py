@@ -48,11 +48,13 @@ class MixtureState(InitialState):
     Args:
         variant: What simulates it.
         time: Its time between frames, as a multiple of the mixture's.
+        substeps: Of the mixture that drew it; one with fewer simulates it with as many fewer, where they are stable.
         static: (M, D) the particles that do not move.
     """
 
     variant: MpmPreset = dataclasses.field(kw_only=True)
     time: float = dataclasses.field(kw_only=True)
+    substeps: int = dataclasses.field(kw_only=True)
     static: Array = dataclasses.field(kw_only=True)
 
 
@@ -138,6 +140,7 @@ class MpmMixture(Preset):
             start.obstacles,
             variant=variant,
             time=time,
+            substeps=self.substeps,
             static=np.concatenate([np.empty((0, 2)), *(bar.particles(self.spacing) for bar in bars)]),
         )
 
@@ -145,6 +148,8 @@ class MpmMixture(Preset):
         if not isinstance(start, MixtureState):
             raise DataError(f"The preset {self.name} simulates only states that it has drawn: each has its own solver.")
         variant, time = start.variant, start.time
+        if self.substeps != start.substeps:
+            variant = variant._with_stable_substeps(math.ceil(variant.substeps * self.substeps / start.substeps))
         if self.coarser > 1:
             variant = variant.coarsened(self.coarser)
         gravity = tuple(pull / time**2 for pull in start.gravity or self.gravity)

@@ -10,6 +10,7 @@ from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.recording import RecordingReader
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim import InitialState, load_preset, preset_from_dict
+from nmpm.sim.predictability import twin_of
 from nmpm.sim.preset import BOUNDARY
 
 UNIVERSAL = load_preset("universal")
@@ -110,3 +111,10 @@ def test_other_states_and_parts_are_refused():
     ):
         with pytest.raises(ConfigError, match=message):
             preset_from_dict(plain | {"parts": parts})
+
+
+def test_a_mixture_of_fewer_substeps_simulates_with_fewer():
+    mixture = of_parts("goop", share=0.0)
+    start = mixture.draw(1)
+    usual, twin = (each.simulate_from(start, 60).position for each in (mixture, twin_of(mixture)))
+    assert 0 < np.abs(usual - twin).max() < 0.05
