@@ -144,12 +144,17 @@ def test_speed_and_accuracy_read_the_committed_tables(run):
     assert all(len(taken) == 1 for taken in names["seconds"].values())
 
 
-@pytest.mark.parametrize("data", ["made up", pytest.param("sample", marks=pytest.mark.slow)])
-def test_your_own_data_become_a_film_and_a_model_that_anybody_can_load(data, run, monkeypatch, request):
-    if data == "sample":
+@pytest.fixture(params=["made up", pytest.param("sample", marks=pytest.mark.slow)])
+def foreign_data(request, monkeypatch):
+    """Grains that the notebooks make up, or those of the recorded data."""
+    if request.param == "sample":
         request.getfixturevalue("recorded")
     else:
         monkeypatch.delenv("NMPM_TEST_DATA", raising=False)
+
+
+@pytest.mark.usefixtures("foreign_data")
+def test_your_own_data_become_a_film_and_a_model_that_anybody_can_load(run):
     names = run("your_own_data")
     assert names["predicted"].shape == (58, 60, 2)
     assert names["theirs"].card["name"] == "blocks/mine"
@@ -157,12 +162,8 @@ def test_your_own_data_become_a_film_and_a_model_that_anybody_can_load(data, run
     assert Image.open("film.gif").n_frames > 1
 
 
-@pytest.mark.parametrize("data", ["made up", pytest.param("sample", marks=pytest.mark.slow)])
-def test_fine_tuning_takes_foreign_data_and_leaves_a_better_model_and_a_picture(data, run, monkeypatch, request):
-    if data == "sample":
-        request.getfixturevalue("recorded")
-    else:
-        monkeypatch.delenv("NMPM_TEST_DATA", raising=False)
+@pytest.mark.usefixtures("foreign_data")
+def test_fine_tuning_takes_foreign_data_and_leaves_a_better_model_and_a_picture(run):
     names = run("fine_tuning")
     assert names["start"].match.reading.scene.materials == ("sand",)
     assert names["overall"][0] >= min(names["overall"])
