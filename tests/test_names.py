@@ -12,7 +12,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from nmpm._support.shipped import PACKAGE
 from nmpm.cli import COMMANDS
 from nmpm.cli.early_checks import argument_names
-from nmpm.data.format import SPLITS
+from nmpm.data.split_files import SPLITS
 
 TREES = {
     str(path.relative_to(PACKAGE)): ast.parse(path.read_text(encoding="utf-8"))

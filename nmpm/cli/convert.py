@@ -66,7 +66,7 @@ def run(words: list[str]) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     from nmpm.data.convert import FORMATS
-    from nmpm.data.format import SPLITS
+    from nmpm.data.split_files import SPLITS
     from nmpm.data.write import SUFFIXES
 
     width = max(len(kind.name) for kind in FORMATS)

@@ -132,7 +132,7 @@ def _open(path: Path, format_name: str | None, options: Options, native: Path) -
 
 def _dataset_of(path: Path) -> Path:
     """The folder of the dataset that an HDF5 file is a split of; other paths unchanged."""
-    from nmpm.data.format import split_paths
+    from nmpm.data.split_files import split_paths
 
     return path.parent if path in split_paths(path.parent).values() else path
 

@@ -14,8 +14,9 @@ from nmpm.data.array_checks import check_axes, check_end
 from nmpm.data.convert.base import make_options
 from nmpm.data.convert.conversion import write_native
 from nmpm.data.convert.runs_in_memory import Runs, open_runs
-from nmpm.data.format import METADATA_FILE, SPLITS, Trajectory, read_metadata, write_metadata, write_split
+from nmpm.data.format import METADATA_FILE, Trajectory, read_metadata, write_metadata, write_split
 from nmpm.data.metadata import scene_metadata
+from nmpm.data.split_files import SPLITS
 from nmpm.data.statistics import first_outside
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene

@@ -12,7 +12,6 @@ from lightning.pytorch.trainer.states import TrainerFn
 
 from nmpm._support.plain_data import from_plain
 from nmpm.data.convert import Options
-from nmpm.data.format import split_paths
 from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
 from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.loading.model_frames import check_horizon
@@ -20,6 +19,7 @@ from nmpm.data.loading.padded_batch import pin_for
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.sources import SourceName, hold_out, make_source
 from nmpm.data.loading.window_plan import PlanStart, WindowPlan
+from nmpm.data.split_files import split_paths
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
 from nmpm.scene import Boundary, Reading, Scene

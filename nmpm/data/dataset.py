@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any, overload
 
 from nmpm.data.convert.base import make_options
-from nmpm.data.format import Metadata, Split, Trajectory, find_split, split_paths
+from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.loading.sources import FolderSource
+from nmpm.data.split_files import find_split, split_paths
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 

@@ -10,7 +10,7 @@ A particle that is not there in a frame has NaN in all coordinates of its positi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -32,14 +32,9 @@ from nmpm.data.metadata import METADATA_FILE as METADATA_FILE
 from nmpm.data.metadata import Metadata as Metadata
 from nmpm.data.metadata_json import read_metadata as read_metadata
 from nmpm.data.metadata_json import write_metadata as write_metadata
+from nmpm.data.split_files import describe_others, split_paths
 from nmpm.errors import DataError
 
-SPLITS = ("train", "valid", "test")
-OTHER_NAMES = {
-    "train": ("training", "trn"),
-    "valid": ("val", "validation", "eval", "dev"),
-    "test": ("testing", "tst"),
-}
 TRUTH = "truth"
 """Dataset of a prediction's group: the recorded positions (T', N, D) beside those that were predicted."""
 VTKHDF = "VTKHDF"
@@ -140,7 +135,7 @@ class Split:
     def __init__(self, path: Path, span: slice = slice(None)) -> None:
         self.path, self.span = Path(path), span
         if not self.path.exists():
-            raise DataError(f"{self.path}: no such file{_other_files(self.path.parent)}.")
+            raise DataError(f"{self.path}: no such file{describe_others(self.path.parent)}.")
         if not self._entries:
             raise DataError(f"{self.path}: the file has no trajectory; {_LAYOUT}.")
 
@@ -274,17 +269,6 @@ def _entry(group: Any, name: str, path: Path) -> _Entry:
     return _Entry(name, frames, particles, dim)
 
 
-def _other_files(folder: Path) -> str:
-    names = sorted(file.name for file in folder.glob("*.h5"))
-    return f" (beside it: {', '.join(names)})" if names else ""
-
-
-def split_paths(folder: Path) -> Mapping[str, Path]:
-    """The split files in a dataset's folder, by name, in the order train, valid, test."""
-    paths = {name: Path(folder) / f"{name}.h5" for name in SPLITS}
-    return {name: path for name, path in paths.items() if path.exists()}
-
-
 def is_native(folder: Path) -> bool:
     """Whether a folder has split files in the native layout; those of a folder with metadata are not looked into."""
     paths = split_paths(folder)
@@ -294,25 +278,3 @@ def is_native(folder: Path) -> bool:
         return bool(Split(next(iter(paths.values()))))
     except DataError:
         return False
-
-
-def find_split(folder: Path, *names: str) -> Path:
-    """The file of the first of the named splits that a folder has; if none, a DataError names those there are."""
-    paths = split_paths(folder)
-    for name in names:
-        if name in paths:
-            return paths[name]
-    missing = " or ".join(f"{name}.h5" for name in names)
-    renames = "".join(f" {rename}" for rename in split_renames(folder, names))
-    raise DataError(f"{folder}: no {missing} there{_other_files(Path(folder))}.{renames}")
-
-
-def split_renames(folder: Path, names: Iterable[str] = SPLITS) -> list[str]:
-    """Advice to rename files such as `val.h5`, a sentence for each, where the named split is missing."""
-    paths = split_paths(folder)
-    return [
-        f"Rename {other}.h5 to {name}.h5."
-        for name in names
-        for other in OTHER_NAMES[name]
-        if name not in paths and (Path(folder) / f"{other}.h5").is_file()
-    ]

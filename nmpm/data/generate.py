@@ -25,18 +25,10 @@ from nmpm._support.bounded_files import NPZ_ERRORS
 from nmpm._support.progress import progress_bar
 from nmpm._support.threads import usable_cores
 from nmpm._support.version import __version__
-from nmpm.data.format import (
-    METADATA_FILE,
-    SPLITS,
-    Metadata,
-    Split,
-    Trajectory,
-    read_metadata,
-    write_metadata,
-    write_split,
-)
+from nmpm.data.format import METADATA_FILE, Metadata, Split, Trajectory, read_metadata, write_metadata, write_split
 from nmpm.data.metadata import scene_metadata
 from nmpm.data.simulation import DRAWS, Shard, SimulationRequest, seed_of_draw, simulate_all
+from nmpm.data.split_files import SPLITS
 from nmpm.data.statistics import MotionStatistics
 from nmpm.errors import DataError
 from nmpm.sim import Preset, SimulatedTrajectory

@@ -10,7 +10,7 @@ from nmpm._support.atomic import lock_folder, new_folder
 from nmpm._support.bounded_files import EXPANSION, FILE_NAME, ZIP_ERRORS, expansion_limit
 from nmpm._support.messages import one_line
 from nmpm._support.shipped import user_home
-from nmpm.data.format import SPLITS
+from nmpm.data.split_files import SPLITS
 from nmpm.errors import ConfigError, DataError
 
 REPOSITORY = "iSach/NeuralMPM"

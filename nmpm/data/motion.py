@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from nmpm.data.facts import find_facts
-from nmpm.data.format import SPLITS, Metadata, Split, find_split
+from nmpm.data.format import Metadata, Split
 from nmpm.data.gravity import Gravity, trajectory_gravity
+from nmpm.data.split_files import SPLITS, find_split
 from nmpm.data.statistics import displacements
 from nmpm.scene import Motion
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from nmpm.data.convert.base import Options
 from nmpm.data.fields import FieldFacts, Kind, add_fields, require_fields
-from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, read_metadata
+from nmpm.data.format import METADATA_FILE, Metadata, Split, read_metadata
 from nmpm.data.gravity import check_gravity, common_gravity, distinct_gravities, trajectory_gravity
+from nmpm.data.split_files import SPLITS, find_split
 from nmpm.data.statistics import Extent, neighbour_distance, without_those_gone
 from nmpm.errors import DataError
 from nmpm.scene import Interval, Scene

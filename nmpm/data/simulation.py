@@ -26,7 +26,7 @@ from typing import Any, TypeVar
 import numpy as np
 from joblib.externals.loky import ProcessPoolExecutor, process_executor
 
-from nmpm.data.format import SPLITS
+from nmpm.data.split_files import SPLITS
 from nmpm.errors import ConfigError, DataError, UnstableError
 from nmpm.sim import Preset
 from nmpm.sim.state import SimulatedTrajectory

@@ -35,8 +35,9 @@ from nmpm.data.convert.tracks import Tracks
 from nmpm.data.convert.vtk import Vtk
 from nmpm.data.convert.vtkhdf import VtkHdf
 from nmpm.data.convert.xyz import Xyz
-from nmpm.data.format import METADATA_FILE, Split, is_native, split_paths
+from nmpm.data.format import METADATA_FILE, Split, is_native
 from nmpm.data.gravity import check_gravity
+from nmpm.data.split_files import split_paths
 from nmpm.errors import ConfigError, DataError, NmpmError
 
 _log = logging.getLogger(__name__)

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any, ClassVar, get_args
 
 from nmpm._support.messages import one_line, suggestion
-from nmpm.data.format import OTHER_NAMES, SPLITS, Metadata, Trajectory
+from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.metadata import STATIC_NAMES
+from nmpm.data.split_files import OTHER_NAMES, SPLITS
 from nmpm.errors import ConfigError, DataError, NmpmError
 from nmpm.scene import Boundary, Interval, check_field_names
 

@@ -15,7 +15,8 @@ from nmpm._support.progress import progress_bar
 from nmpm.data.array_checks import check_end
 from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset
 from nmpm.data.facts import FOUND, FactFinder
-from nmpm.data.format import SPLITS, Metadata, Split, Trajectory, write_metadata, write_split
+from nmpm.data.format import Metadata, Split, Trajectory, write_metadata, write_split
+from nmpm.data.split_files import SPLITS
 from nmpm.data.statistics import (
     STATISTICS_KEYS,
     Extent,

@@ -37,7 +37,8 @@ from nmpm.data.convert.base import (
 from nmpm.data.convert.frame import Frame, Layout, ParticleArrays, flat_axes
 from nmpm.data.convert.frame_stack import FrameStack
 from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, open_divided, placeholder_metadata
-from nmpm.data.format import SPLITS, Metadata, Trajectory
+from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.split_files import SPLITS
 from nmpm.errors import DataError
 
 _DEPTH = 3  # of folders

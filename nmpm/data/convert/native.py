@@ -13,7 +13,8 @@ from typing import ClassVar
 
 from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, split_files
 from nmpm.data.described import DESCRIPTION, described_metadata
-from nmpm.data.format import METADATA_FILE, Metadata, Split, Trajectory, read_metadata, split_paths
+from nmpm.data.format import METADATA_FILE, Metadata, Split, Trajectory, read_metadata
+from nmpm.data.split_files import split_paths
 from nmpm.errors import DataError
 
 _PATTERNS = ("*.h5", "*.vtkhdf")

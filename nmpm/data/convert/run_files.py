@@ -13,8 +13,9 @@ import numpy as np
 
 from nmpm._support.messages import counted
 from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, split_files, split_runs
-from nmpm.data.format import SPLITS, Metadata, Trajectory
+from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.metadata import find_family
+from nmpm.data.split_files import SPLITS
 from nmpm.errors import DataError
 
 LEAST_FRAMES = 16

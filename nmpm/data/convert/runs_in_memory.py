@@ -12,7 +12,8 @@ import numpy as np
 from nmpm.data.convert.base import ForeignDataset, Options
 from nmpm.data.convert.run_arrays import RunArrays, group_runs
 from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Facts, Run, open_divided, placeholder_metadata
-from nmpm.data.format import SPLITS, Metadata, Trajectory
+from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.split_files import SPLITS
 from nmpm.errors import DataError
 
 Arrays = np.ndarray | Mapping[str, np.ndarray]

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 
 from nmpm._support.messages import one_line
-from nmpm.data.format import Split, Trajectory, split_paths
+from nmpm.data.format import Split, Trajectory
 from nmpm.data.hdf5 import open_hdf5
 from nmpm.data.inspection.dataset_checks import DatasetChecks
 from nmpm.data.inspection.findings import Finding, Severity, merge_findings
 from nmpm.data.inspection.shared_runs import find_shared_runs
 from nmpm.data.loading.sources import FolderSource
+from nmpm.data.split_files import split_paths
 from nmpm.errors import DataError
 
 _TRAJECTORIES = {"train": 2, "valid": 1, "test": 1}

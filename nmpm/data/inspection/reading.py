@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.messages import one_line
-from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, split_paths, split_renames
+from nmpm.data.format import METADATA_FILE, Metadata, Split
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.metadata import FAMILIES
 from nmpm.data.metadata_json import load_json, parse_metadata
+from nmpm.data.split_files import SPLITS, find_split, split_paths, split_renames
 from nmpm.data.statistics import extent_of
 from nmpm.errors import ConfigError, DataError
 

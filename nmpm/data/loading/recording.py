@@ -21,9 +21,10 @@ from torch import Tensor
 from nmpm._support.threads import raise_if_abandoned
 from nmpm.data.array_checks import check_end
 from nmpm.data.fields import check_finite, read_fields, require_fields
-from nmpm.data.format import Metadata, Split, Trajectory, split_paths
+from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.loading.presence import Presence, find_tracks, obstacle_frames
+from nmpm.data.split_files import split_paths
 from nmpm.data.statistics import first_moving_particle, first_outside, without_those_gone
 from nmpm.data.times import check_times
 from nmpm.data.volumes import check_positive, mean_volume, stated_volumes, volumes

@@ -15,13 +15,14 @@ from typing import Any
 from nmpm._support.progress import progress_bar
 from nmpm._support.threads import Task, raise_if_abandoned, usable_cores
 from nmpm.data import catalog
-from nmpm.data.format import SPLITS, Trajectory
+from nmpm.data.format import Trajectory
 from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.buffer import RecordingProvider
 from nmpm.data.loading.recording import Recording, RecordingReader
 from nmpm.data.loading.sources import DataSource
 from nmpm.data.loading.window_plan import EndlessWindowPlan, WindowPlan
 from nmpm.data.simulation import simulate_all
+from nmpm.data.split_files import SPLITS
 from nmpm.errors import ConfigError
 from nmpm.scene import Reading, Scene
 from nmpm.sim import Preset

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from nmpm.data.convert import Options, native_folder
-from nmpm.data.format import Metadata, Split, find_split, is_native, read_metadata, split_renames
+from nmpm.data.format import Metadata, Split, is_native, read_metadata
 from nmpm.data.hub import hub_folder
 from nmpm.data.loading.buffer import RecordingProvider
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.window_plan import WindowPlan
 from nmpm.data.scene_inference import infer_scene
+from nmpm.data.split_files import find_split, split_renames
 from nmpm.errors import ConfigError
 from nmpm.scene import Reading, Scene
 

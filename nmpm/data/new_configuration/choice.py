@@ -6,13 +6,14 @@ import math
 from dataclasses import dataclass, replace
 
 from nmpm.data.facts import FOUND, find_facts
-from nmpm.data.format import Split, find_split, split_paths
+from nmpm.data.format import Split
 from nmpm.data.grid_rule import GridCost, GridFacts, Machine, TrainingSize, grid_cost, recommended_cells, training_size
 from nmpm.data.inspection.irregular_motion import smoothing_frames
 from nmpm.data.inspection.reading import open_dataset
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.metadata import FAMILIES
 from nmpm.data.new_configuration.survey import Survey, survey
+from nmpm.data.split_files import find_split, split_paths
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 

@@ -9,12 +9,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from nmpm._support.progress import progress_bar
-from nmpm.data.format import Metadata, Split, Trajectory, find_split, split_paths
+from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.grid_rule import GridFacts, candidates
 from nmpm.data.inspection.irregular_motion import white_noise
 from nmpm.data.inspection.measurements import Measurements
 from nmpm.data.loading.sources import FolderSource
+from nmpm.data.split_files import find_split, split_paths
 from nmpm.data.statistics import displacements
 from nmpm.data.times import uneven_step
 from nmpm.scene import Scene

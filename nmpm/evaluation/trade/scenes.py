@@ -14,7 +14,7 @@ import torch
 
 from nmpm._support.messages import suggestion
 from nmpm.data.catalog import catalog, dataset_folder, ensure, find_simulated
-from nmpm.data.format import Split, find_split, read_metadata
+from nmpm.data.format import Split, read_metadata
 from nmpm.data.generate import generate
 from nmpm.data.loading.padded_batch import collate, displacements
 from nmpm.data.loading.recording import Recording, SplitRecordings
@@ -22,6 +22,7 @@ from nmpm.data.loading.sources import FolderSource
 from nmpm.data.motion import measure_motion
 from nmpm.data.scene_inference import infer_scene
 from nmpm.data.simulation import SimulationRequest
+from nmpm.data.split_files import find_split
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Window
 from nmpm.scene import Motion, Scene
