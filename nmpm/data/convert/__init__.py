@@ -10,6 +10,7 @@ import logging
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 from nmpm._support.atomic import lock_folder
@@ -26,7 +27,7 @@ from nmpm.data.convert.dmcf import Dmcf
 from nmpm.data.convert.gns_npz import GnsNpz
 from nmpm.data.convert.lammps import Lammps
 from nmpm.data.convert.native import Native, NativeFiles
-from nmpm.data.convert.nearest import describe_unknown
+from nmpm.data.convert.nearest import describe_several, describe_unknown, has_splits, subfolders
 from nmpm.data.convert.neuralmpm import NeuralMpm
 from nmpm.data.convert.ply import Ply
 from nmpm.data.convert.retiming import retime
@@ -41,6 +42,8 @@ from nmpm.data.split_files import split_paths
 from nmpm.errors import ConfigError, DataError, NmpmError
 
 _log = logging.getLogger(__name__)
+_MOST_INNER = 100
+"""Folders in a folder of no known format that are looked at."""
 
 FORMATS: tuple[DatasetFormat, ...] = (
     Native(),
@@ -86,11 +89,21 @@ def _find_format(path: Path, name: str | None) -> DatasetFormat:
         raise DataError(f"{path}: no such file or folder.")
     if path.is_file() and not path.stat().st_size:
         raise DataError(f"{path}: the file is empty. Copy, download or write it again.")
-    for kind in FORMATS:
-        with suppress(NmpmError, OSError):
-            if kind.recognises(path):
-                return kind
-    raise DataError(describe_unknown(path))
+    inner = list(islice(subfolders(path), _MOST_INNER))
+    if sum(map(has_splits, inner)) < 2:
+        for kind in FORMATS:
+            with suppress(NmpmError, OSError):
+                if kind.recognises(path):
+                    return kind
+    datasets = [folder for folder in inner if _is_dataset(folder)]
+    raise DataError(describe_several(path, datasets) if datasets else describe_unknown(path))
+
+
+def _is_dataset(folder: Path) -> bool:
+    """Whether a folder is of a known format, as a whole."""
+    with suppress(NmpmError, OSError):
+        return bool(_find_format(folder, None))
+    return False
 
 
 def convert(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from nmpm.data.convert.array_files import ArrayFiles, open_arrays
 from nmpm.data.convert.named_arrays import Arrays, can_be_positions, describe, with_meaning
 from nmpm.data.convert.tables import SUFFIXES
 from nmpm.data.convert.tracks import table_columns
+from nmpm.data.split_files import SPLITS
 from nmpm.errors import NmpmError
 
 _PAGE = "docs/howto/your_data.md shows all forms."
@@ -38,7 +39,6 @@ HINTS: Mapping[str, str] = {
             ".bgeo .sc .abc .usd .usda .usdc .obj",
             "Houdini or Blender write it as a .ply file per frame, which are read",
         ),
-        (".tfrecord", "DeepMind's datasets need their metadata.json beside them"),
     )
     for suffix in suffixes.split()
 }
@@ -60,6 +60,24 @@ def describe_unknown(path: Path) -> str:
         return f"{_table_problem(first)} {_PAGE}"
     shown = ", ".join(str(file.relative_to(path)) for file in files[:8]) if path.is_dir() else "a file"
     return f"{path}: no known format; found {shown}. If you can load it in Python: {_WRITE}. {_PAGE}"
+
+
+def describe_several(path: Path, datasets: Sequence[Path]) -> str:
+    """A sentence on a folder that is no dataset, but has some in it, which are to be named."""
+    names = ", ".join(folder.name for folder in datasets[:8])
+    more = f" and {len(datasets) - 8} more" if len(datasets) > 8 else ""
+    several = f"several datasets, {names}{more}" if len(datasets) > 1 else f"a dataset, {names}"
+    return f"{path}: the folder is not one dataset but holds {several}: name one of them, e.g. {datasets[0]}."
+
+
+def subfolders(path: Path) -> Iterator[Path]:
+    """The folders in a folder, in the order of their names; none in a file."""
+    return (inner for inner in sorted(path.glob("*")) if inner.is_dir()) if path.is_dir() else iter(())
+
+
+def has_splits(folder: Path) -> bool:
+    """Whether a folder has files or folders called train, valid or test, and is a dataset of its own."""
+    return folder.name not in SPLITS and any(inner.name.split(".")[0] in SPLITS for inner in folder.glob("*"))
 
 
 def _files(path: Path) -> Iterator[Path]:

@@ -1,5 +1,7 @@
 """What is said of data of no known form."""
 
+import shutil
+
 import h5py
 import numpy as np
 import pytest
@@ -74,3 +76,24 @@ def test_trajectories_of_a_frame_each_are_refused(tmp_path):
     np.savez(tmp_path / "a.npz", positions=RUN[:, :1])
     with pytest.raises(DataError, match="its trajectories have one frame each"):
         native_folder(tmp_path / "a.npz")
+
+
+def test_the_datasets_in_a_folder_are_named(tmp_path):
+    for name in ("sand", "water"):
+        (tmp_path / name).mkdir()
+        np.savez(tmp_path / name / "run.npz", positions=RUN)
+    (tmp_path / "notes").mkdir()
+    with pytest.raises(DataError, match=r"holds several datasets, sand, water: name one of them, e\.g\. .*/sand\.$"):
+        open_dataset(tmp_path)
+    shutil.rmtree(tmp_path / "sand")
+    with pytest.raises(DataError, match=r"is not one dataset but holds a dataset, water: .*/water\.$"):
+        open_dataset(tmp_path)
+
+
+def test_folders_with_splits_of_their_own_are_not_runs_of_one_dataset(tmp_path):
+    for part in ("sand/train", "sand/test", "water/train", "water/test"):
+        (tmp_path / part).mkdir(parents=True)
+        (tmp_path / part / "run.xyz").write_text("2\n\nA 0 0 0\nA 1 1 0\n" * 3)
+    assert set(open_dataset(tmp_path / "sand").splits) == {"train", "test"}
+    with pytest.raises(DataError, match="holds several datasets, sand, water: "):
+        open_dataset(tmp_path)
