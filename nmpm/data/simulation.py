@@ -28,7 +28,7 @@ from joblib.externals.loky import ProcessPoolExecutor, process_executor
 
 from nmpm.data.split_files import SPLITS
 from nmpm.errors import ConfigError, DataError, UnstableError
-from nmpm.sim import Preset
+from nmpm.sim import Preset, name_parts
 from nmpm.sim.state import SimulatedTrajectory
 
 DRAWS = 5
@@ -132,16 +132,22 @@ class Shard:
         return list(items[self.index - 1 :: self.count])
 
 
+def in_short(request: Mapping[str, Any]) -> dict[str, Any]:
+    """A request as `SimulationRequest.to_dict` states it, with the names of the presets that a mixture is of."""
+    preset = request.get("preset")
+    return {**request, "preset": name_parts(preset)} if isinstance(preset, Mapping) else dict(request)
+
+
 def same_trajectories(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
     """Whether two requests, as `SimulationRequest.to_dict` states them, give the same trajectories, if not as many."""
     return all(one.get(key) == other.get(key) for key in ("preset", "seed", "revision"))
 
 
 def same_test_scenes(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two requests, as `SimulationRequest.to_dict` states them, give the same test trajectories."""
+    """Whether two requests, stated in full or in short, give the same test trajectories."""
     counts = [request.get("counts") for request in (one, other)]
     first, second = (count.get("test") if isinstance(count, Mapping) else None for count in counts)
-    return first == second and same_trajectories(one, other)
+    return first == second and same_trajectories(in_short(one), in_short(other))
 
 
 def _differences(path: str, stored: Mapping[str, Any], asked: Mapping[str, Any]) -> Iterator[str]:

@@ -4,7 +4,7 @@
 SPH, 2-D) implement it, and `presets/` describes the shipped scenes.
 """
 
-from nmpm.sim.loading import load_preset, preset_from_dict, preset_names
+from nmpm.sim.loading import load_preset, name_parts, preset_from_dict, preset_names
 from nmpm.sim.mpm.layouts import SimulatedRamp
 from nmpm.sim.mpm.preset import MpmPreset
 from nmpm.sim.preset import Preset
@@ -17,6 +17,7 @@ __all__ = [
     "SimulatedRamp",
     "SimulatedTrajectory",
     "load_preset",
+    "name_parts",
     "preset_from_dict",
     "preset_names",
 ]

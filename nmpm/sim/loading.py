@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -67,18 +67,30 @@ def preset_from_dict(plain: Mapping[str, Any]) -> Preset:
     solver = str(entries.pop("solver", None))
     if solver not in SOLVERS:
         raise ConfigError(f"solver = {one_line(solver, 80)} is not one of {', '.join(SOLVERS)}.")
-    return SOLVERS[solver].from_dict(_with_parts_loaded(entries))
+    return SOLVERS[solver].from_dict(_with_parts(entries, _described))
 
 
-def _with_parts_loaded(entries: dict[str, Any]) -> dict[str, Any]:
-    """The entries of a mixture with descriptions of its parts in place of their names."""
-    parts = entries.get("parts")
+def name_parts(plain: Mapping[str, Any]) -> dict[str, Any]:
+    """What `Preset.to_dict` describes, with the names of a mixture's parts that are shipped presets."""
+    return _with_parts(plain, _named)
+
+
+def _with_parts(plain: Mapping[str, Any], change: Callable[[Any], Any]) -> dict[str, Any]:
+    """A description with another preset in each of the parts of a mixture."""
+    parts = plain.get("parts")
     if not isinstance(parts, list | tuple):
-        return entries
-    loaded = [
-        part | {"preset": load_preset(part["preset"]).to_dict()}
-        if isinstance(part, dict) and isinstance(part.get("preset"), str)
-        else part
-        for part in parts
+        return dict(plain)
+    is_part = [isinstance(part, dict) and "preset" in part for part in parts]
+    changed = [
+        part | {"preset": change(part["preset"])} if yes else part for part, yes in zip(parts, is_part, strict=True)
     ]
-    return entries | {"parts": loaded}
+    return {**plain, "parts": changed}
+
+
+def _described(part: Any) -> Any:
+    return load_preset(part).to_dict() if isinstance(part, str) else part
+
+
+def _named(part: Any) -> Any:
+    name = part.get("name") if isinstance(part, dict) else None
+    return name if name in preset_names() and load_preset(name).to_dict() == part else part

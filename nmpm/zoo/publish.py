@@ -20,6 +20,7 @@ from nmpm._support.atomic import atomic_folder
 from nmpm._support.bounded_files import to_yaml
 from nmpm._support.digests import float32_digest
 from nmpm._support.shipped import PACKAGE, shipped_folder, user_zoo
+from nmpm.data.simulation import in_short
 from nmpm.emulator import Emulator
 from nmpm.emulator.adaptation import adapted
 from nmpm.errors import ZooError
@@ -156,6 +157,7 @@ def _is_weight(name: str, value: Tensor) -> bool:
 def _card(
     name: str, about: str, figures: Mapping[str, Any], rows: Sequence[Mapping[str, float]], emulator: Emulator
 ) -> dict[str, Any]:
+    simulation = {"simulation": in_short(figures["simulation"])} if figures.get("simulation") else {}
     return {
         "format": FORMAT,
         "name": name,
@@ -168,7 +170,8 @@ def _card(
         "interval": intervals(rows),
         "constraints": dataclasses.asdict(emulator.constraints),
         "obstacles": emulator.scene.obstacles,
-        **{key: figures[key] for key in ("particles", "simulation") if figures.get(key)},
+        **({"particles": figures["particles"]} if figures.get("particles") else {}),
+        **simulation,
         "golden": golden_rollout(emulator),
         "versions": figures["versions"],
     }

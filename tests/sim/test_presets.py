@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from nmpm.errors import ConfigError, DataError, NmpmError
-from nmpm.sim import InitialState, load_preset, preset_from_dict, preset_names
+from nmpm.sim import InitialState, load_preset, name_parts, preset_from_dict, preset_names
 from nmpm.sim.mpm.layouts import SimulatedRamp, distance_to_ramps
 from nmpm.sim.preset import BOUNDARY
 from nmpm.sim.sph.boundary import PolygonObstacle
@@ -42,6 +42,16 @@ def test_presets_round_trip_and_have_the_papers_sizes(name):
     if name in SIZES:
         most = preset.blocks.particles[1] if preset.blocks else preset.column.width * preset.column.height / 0.02**2
         assert (most, preset.frames) == SIZES[name]
+
+
+def test_mixtures_name_the_parts_that_are_shipped_presets():
+    plain = load_preset("universal").to_dict()
+    short = name_parts(plain)
+    assert [part["preset"] for part in short["parts"][:2]] == ["multimaterial", "sandramps"]
+    assert preset_from_dict(json.loads(json.dumps(short))).to_dict() == plain
+    slower = plain["parts"][0]["preset"] | {"frame_dt": 0.005}
+    assert name_parts({"parts": [{"preset": slower}, "?"]}) == {"parts": [{"preset": slower}, "?"]}
+    assert name_parts(GOOP.to_dict()) == GOOP.to_dict()
 
 
 def test_scenes_state_the_facts():

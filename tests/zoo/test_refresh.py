@@ -227,9 +227,7 @@ def test_shipped_cards_are_short_and_their_pages_are_made_of_them(name):
     card = Zoo.card(name, SHIPPED)
     assert stated_milliseconds(card)["AMD EPYC, 1 thread"] > 0
     assert ("twin" not in card) == (name == "waterdrop")
-    assert len((SHIPPED / name / "card.yaml").read_text().splitlines()) <= (
-        320 if name == "universal" else 120
-    )  # mixed of six presets
+    assert len((SHIPPED / name / "card.yaml").read_text().splitlines()) <= 120
     page = entry_page(card, [path.name for path in (SHIPPED / name).iterdir()])
     assert (SHIPPED / name / "README.md").read_text() == page
 
