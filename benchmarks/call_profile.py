@@ -9,6 +9,7 @@ without the kernels: Python and torch between them. The kernels' own time contai
 
 from __future__ import annotations
 
+import copy
 import statistics
 import sys
 from collections.abc import Callable, Mapping
@@ -18,8 +19,7 @@ import torch
 from timing import clock_for, describe_machine, make_timing_parser, time_alternating, write_json
 
 from nmpm.emulator import Emulator, RolloutContext
-from nmpm.emulator.fused.call import KernelCall
-from nmpm.errors import ConfigError
+from nmpm.emulator.engines import find_engine
 from nmpm.evaluation.stress import ModelUnderTest
 from nmpm.particles import Particles
 from nmpm.sim import load_preset
@@ -42,21 +42,18 @@ def late_state(emulator: Emulator, name: str) -> tuple[Particles, RolloutContext
 
 def split_call(emulator: Emulator, particles: Particles, context: RolloutContext) -> dict[str, Callable[[], object]]:
     """The whole call, and each of its parts on the values that the call gives it."""
-    parameters = emulator.kernel_parameters
-    if parameters is None:
-        raise ConfigError("Its parts are no kernels (`nmpm.emulator.fused.parameters`): profile another model.")
-    call = KernelCall(emulator, parameters, context)
-    start = call.rasterise(particles)
-    normalised = call.normalise(start)
-    output = emulator.runtime.fields(emulator.processor, normalised, emulator.network_precision)
-    path = call.path(start, output)
+    engine = find_engine(emulator, particles, context.solid)
+    start = engine.rasterise(particles, context)
+    seen = engine.normalise(start, context)
+    output = engine.network(seen)
+    flight = engine.fly(start, output, context)
     return {
         CALL: lambda: emulator(particles, context),
-        NETWORK: lambda: emulator.runtime.fields(emulator.processor, normalised, emulator.network_precision),
-        "p2g": lambda: call.rasterise(particles),
-        "normalise": lambda: call.normalise(start),
-        "path and constraints": lambda: call.path(start, output),
-        "velocity, density cap, to length": lambda: call.finish(start, path.copy()),
+        NETWORK: lambda: engine.network(seen),
+        "rasterise": lambda: engine.rasterise(particles, context),
+        "normalise": lambda: engine.normalise(start, context),
+        "fly": lambda: engine.fly(start, output, context),
+        "spread and land": lambda: engine.land(start, engine.spread(start, copy.deepcopy(flight), context)),
     }
 
 

@@ -1,4 +1,4 @@
-"""The bundle of frames that one call predicts: what it starts from, its result, and what a rollout's calls share."""
+"""The bundle of frames that one call predicts, and what the calls of a rollout share."""
 
 from __future__ import annotations
 
@@ -9,52 +9,11 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from nmpm.emulator.fused.arrays import ArrayCache
 from nmpm.particles import Particles
 
 if TYPE_CHECKING:
-    from nmpm.emulator.fused.solids import SolidCache
-
-
-@dataclass(frozen=True)
-class BundleStart:
-    """The particles at the start of a bundle and the grids around them, in cells and cells per frame.
-
-    Args:
-        cells: (B, N, D) positions.
-        velocity: (B, N, D) the particles' own velocities.
-        gravity: (B, 1, D), what a frame adds to a velocity.
-        material: (B, N) indices into the scene's materials.
-        volume: (B, N) as `Particles.present_volume`.
-        mask: (B, N) bool, False for padding.
-        state: (B, C_in, *S), what the network has seen; velocities first, as in `output`.
-        output: (B, m, C, *S), what the network predicts, C = materials * D; of its own precision.
-        scale: (m, C, 1, ...), by which it is multiplied.
-        solids: (B, m, *S) solid fraction at each of the frames, where obstacles move; None where they do not.
-    """
-
-    cells: Tensor
-    velocity: Tensor
-    gravity: Tensor
-    material: Tensor
-    volume: Tensor
-    mask: Tensor
-    state: Tensor
-    output: Tensor
-    scale: Tensor
-    solids: Tensor | None = None
-
-    @property
-    def fields(self) -> Tensor:
-        """(B, m, C, *S), the predicted velocities, of the scale's precision."""
-        return self.output.to(torch.promote_types(self.scale.dtype, torch.float32)) * self.scale
-
-    @property
-    def filled(self) -> Tensor:
-        """(B, 1, *S), the volume fraction of all materials that the network has seen."""
-        velocities = self.output.shape[2]
-        materials = velocities // self.cells.shape[-1]
-        return self.state[:, velocities : velocities + materials].sum(1, keepdim=True)
+    from nmpm.emulator.engines.numba.arrays import ArrayCache
+    from nmpm.emulator.engines.numba.solids import SolidCache
 
 
 @dataclass(frozen=True)
@@ -103,7 +62,7 @@ class RolloutContext:
     def scenes(self, chosen: list[int]) -> RolloutContext:
         """The context of part of the batch."""
         budget = None if self.budget is None else self.budget[chosen]
-        if self.solid_caches is None:
+        if self.solid_caches is None or self.array_cache is None:
             return RolloutContext(self.solid[chosen], budget)
         caches = tuple(self.solid_caches[scene] for scene in chosen)
-        return RolloutContext(self.solid[chosen], budget, caches, ArrayCache())
+        return RolloutContext(self.solid[chosen], budget, caches, type(self.array_cache)())

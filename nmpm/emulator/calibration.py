@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from nmpm._support.collectives import all_gather, rank_and_world_size
+from nmpm.emulator.engines.torch.engine import TorchEngine
 from nmpm.emulator.fields import calibrate_fields, true_rates
 from nmpm.emulator.model import UNLIMITED, Emulator
-from nmpm.emulator.prediction import TensorSteps
 from nmpm.emulator.prescribed import start_of
 from nmpm.emulator.rasterise import volume_fraction
 from nmpm.particles import Particles, Window
@@ -148,7 +148,7 @@ def density_cap(emulator: Emulator, windows: Sequence[Window]) -> float:
 
 def _inputs(emulator: Emulator, windows: Sequence[Window]) -> _Inputs:
     starts = [start_of(window, emulator.frames) for window in windows]
-    state = torch.cat([TensorSteps(emulator).rasterise(start, emulator.solid(start))[-1] for start in starts])
+    state = torch.cat([TorchEngine(emulator).grid_state(start, emulator.solid(start))[-1] for start in starts])
     axes = (0, *range(2, state.dim()))
     cells = state.numel() // state.shape[1]
     figures = (state.mean(axes), state.std(axes), state.amin(axes), state.amax(axes))

@@ -81,8 +81,8 @@ class Constraints:
         energy: Kinetic and potential energy never exceed those of the rollout's first state: for scenes of known
             gravity that nothing feeds. It does not act where obstacles move, axes are open or particles enter.
         rest_speed: Particles that move fewer cells per frame than this, on average over a bundle, and do not fall
-            freely, stay where they are if something holds them up (`nmpm.emulator.support`), and fall otherwise. Set it
-            to the speed that the model predicts in material that is at rest.
+            freely, stay where they are if something holds them up, and fall otherwise. Set it to the speed that the
+            model predicts in material that is at rest.
         solids: Particles do not enter obstacles.
         bounds: Rule for particles that would leave the scene's bounds, one of `BOUNDS`; in training too.
         density_cap: Volume fraction above which the particles of a cell spread into the room around it, after each

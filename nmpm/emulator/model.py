@@ -22,9 +22,10 @@ from nmpm.decoders import Decoder
 from nmpm.emulator.bundle import Bundle as Bundle
 from nmpm.emulator.bundle import RolloutContext as RolloutContext
 from nmpm.emulator.constraints import Constraints, energy, mass_shares
+from nmpm.emulator.engines import find_engine
+from nmpm.emulator.engines.numba.parameters import KernelParameters, kernel_parameters
+from nmpm.emulator.engines.rules import MODELS, lacks, model_engines
 from nmpm.emulator.fields import FieldScales
-from nmpm.emulator.fused.parameters import kernel_parameters
-from nmpm.emulator.prediction import steps_for
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
 from nmpm.errors import ConfigError
@@ -51,6 +52,7 @@ class Emulator(nn.Module):
 
     Attributes:
         runtime: Computes the network.
+        engines: Names of the engines beside torch's that compute all that the recipe has, the fastest first.
         thread_choice: Sets torch's number of threads for each call; None to leave it alone.
     """
 
@@ -66,7 +68,7 @@ class Emulator(nn.Module):
     def __init__(self, recipe: EmulatorRecipe) -> None:
         super().__init__()
         self.recipe = recipe
-        self.kernel_parameters = kernel_parameters(recipe)
+        self._set_engines(recipe)
         self.runtime: Runtime = Eager()
         self.thread_choice: ThreadChoice | None = None
         self.grid = recipe.grid
@@ -163,8 +165,21 @@ class Emulator(nn.Module):
 
     def _with_recipe(self, recipe: EmulatorRecipe) -> Emulator:
         other = copy.copy(self)
-        other.recipe, other.grid, other.kernel_parameters = recipe, recipe.grid, kernel_parameters(recipe)
+        other.recipe, other.grid = recipe, recipe.grid
+        other._set_engines(recipe)
         return other
+
+    def _set_engines(self, recipe: EmulatorRecipe) -> None:
+        """Find out which engines compute all of a recipe, and what those with kernels need of it."""
+        self.engines = model_engines(recipe)
+        self._kernel_parameters = kernel_parameters(recipe) if self.engines else None
+
+    @property
+    def kernel_parameters(self) -> KernelParameters:
+        """What engines with kernels need; raises ConfigError if none of them computes all that the recipe has."""
+        if self._kernel_parameters is None:
+            raise ConfigError(f"No engine with kernels takes {', '.join(lacks('numba', MODELS, self.recipe))}.")
+        return self._kernel_parameters
 
     def with_grid_moved(self, shift: Sequence[float]) -> Emulator:
         """This emulator with its grid moved by `shift` (D,), in domain length; weights and statistics are shared.
@@ -201,7 +216,7 @@ class Emulator(nn.Module):
     def surroundings(self, particles: Particles, budget: Tensor | None) -> RolloutContext:
         """The context of calls among the obstacles of a state, within an energy if there is one."""
         solid = self.solid(particles)
-        return steps_for(self, particles, solid).prepare_rollout(solid, budget)
+        return find_engine(self, particles, solid).prepare(solid, budget)
 
     def solid(self, particles: Particles) -> Tensor:
         """Share of each cell that is wall or obstacle, (B, C_solid, *S), C_solid 0 or 1."""
@@ -241,7 +256,7 @@ class Emulator(nn.Module):
 
     def predict(self, particles: Particles, context: RolloutContext) -> Bundle:
         """The bundle, with only the network left to the runtime."""
-        return steps_for(self, particles, context.solid).predict(particles, context)
+        return find_engine(self, particles, context.solid).predict(particles, context)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *options: Any) -> None:
         """As torch's, of plain weights also into a network that is wrapped by `torch.compile`."""

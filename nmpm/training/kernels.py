@@ -15,9 +15,9 @@ from torch.autograd.function import once_differentiable
 
 from nmpm._support.jit import jit, jit_sum
 from nmpm._support.threads import for_each
-from nmpm.emulator.fused.arrays import as_array, material_rows
+from nmpm.emulator.engines.numba.arrays import as_array, material_rows
+from nmpm.emulator.engines.numba.scatter import scatter, scatter_adjoint
 from nmpm.grid import Grid
-from nmpm.transfer.fused.scatter import scatter, scatter_adjoint
 
 ZERO = np.float32(0)
 _LINEAR = (0, 0)

@@ -230,4 +230,4 @@ def _kernel_counts(cells: Tensor, window: Window, scene: Scene, grid: Grid) -> T
 def _kernels_support(predicted: Tensor, target: Tensor, grid: Grid) -> bool:
     """Whether the kernels can compute the error: with gradients with respect to the prediction alone."""
     fixed = not target.requires_grad and not torch.compiler.is_compiling()
-    return fixed and grid.dim == 2 and kernels_take(predicted, target)  # see `KernelParameters.trains`
+    return fixed and grid.dim == 2 and kernels_take(predicted, target)

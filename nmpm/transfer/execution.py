@@ -100,7 +100,7 @@ def scatter_backend(name: str) -> Iterator[None]:
 
 @contextmanager
 def without_kernels() -> Iterator[None]:
-    """Compute with tensor operations alone within a `with` block, without the kernels of `nmpm.emulator.fused`."""
+    """Compute with tensor operations alone within a `with` block, without kernels."""
     token = _kernels.set(False)
     try:
         yield
@@ -110,12 +110,17 @@ def without_kernels() -> Iterator[None]:
 
 def is_default() -> bool:
     """Whether code runs outside of `scatter_backend` and `without_kernels`."""
-    return _kernels.get() and _backend.get() is None
+    return kernels_are_on() and _backend.get() is None
+
+
+def kernels_are_on() -> bool:
+    """Whether code runs outside of `without_kernels`."""
+    return _kernels.get()
 
 
 def kernels_take(*values: Tensor) -> bool:
     """Whether fused kernels can take these tensors: float32 on a CPU, outside of `without_kernels`."""
-    return _kernels.get() and all(each.device.type == "cpu" and each.dtype == torch.float32 for each in values)
+    return kernels_are_on() and all(each.device.type == "cpu" and each.dtype == torch.float32 for each in values)
 
 
 def add(source: Tensor, index: Tensor, size: int) -> Tensor:

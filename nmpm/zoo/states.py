@@ -13,7 +13,7 @@ from torch import Tensor
 from nmpm._support.messages import one_line, suggestion
 from nmpm.emulator.bodies import sample_bodies
 from nmpm.emulator.calibration import calibrated_range, gravity_range
-from nmpm.emulator.contact import Contact, obstacle_share
+from nmpm.emulator.engines.torch.contact import Contact, obstacle_share
 from nmpm.emulator.fields import warn_of_ignored
 from nmpm.emulator.input_checks import check_inputs
 from nmpm.emulator.model import Emulator

@@ -86,9 +86,9 @@ def test_the_energy_of_no_frame_exceeds_that_of_the_first_state(branching, cap, 
 
 def without_branches(monkeypatch):
     """As on a GPU: nothing is decided by reading values back, and no kernel of the CPU runs."""
-    monkeypatch.setattr("nmpm.emulator.prediction.kernels_take", lambda *_: False)
+    monkeypatch.setattr("nmpm.emulator.engines.rules.kernels_are_on", lambda: False)
     for module in ("advection", "contact", "crowding"):
-        monkeypatch.setattr(f"nmpm.emulator.{module}.is_eager_cpu", lambda values: False)
+        monkeypatch.setattr(f"nmpm.emulator.engines.torch.{module}.is_eager_cpu", lambda values: False)
 
 
 @pytest.mark.parametrize("scale", [0.01, 3.0])

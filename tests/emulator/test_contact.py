@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.data.initial_states import lattice
-from nmpm.emulator.contact import SURFACE, Contact
+from nmpm.emulator.engines.torch.contact import SURFACE, Contact
 from nmpm.emulator.rollouts import rollout
 from nmpm.grid import Grid
 from tests.scenes import box, cloud, emulator_of, with_obstacle
@@ -109,7 +109,7 @@ def test_the_dense_form_in_chunks_is_the_same(monkeypatch):
     start, path = jumble()
     whole = block().hold_all(start, path)
     in_sevens = lambda count, *_, **__: [slice(i, i + 7) for i in range(0, count, 7)]  # noqa: E731
-    monkeypatch.setattr("nmpm.emulator.contact.chunks", in_sevens)
+    monkeypatch.setattr("nmpm.emulator.engines.torch.contact.chunks", in_sevens)
     torch.testing.assert_close(block().hold_all(start, path), whole, rtol=0, atol=1e-5)
 
 

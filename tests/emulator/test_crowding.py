@@ -8,8 +8,8 @@ from torch import Tensor
 
 from nmpm.data.initial_states import lattice
 from nmpm.emulator import Emulator
-from nmpm.emulator.contact import SURFACE
-from nmpm.emulator.crowding import MAX_SHIFT, Crowding
+from nmpm.emulator.engines.torch.contact import SURFACE
+from nmpm.emulator.engines.torch.crowding import MAX_SHIFT, Crowding
 from nmpm.emulator.rollouts import rollout, unroll
 from nmpm.grid import Grid
 from nmpm.particles import Particles
@@ -58,7 +58,7 @@ def test_a_block_below_the_cap_stays_to_the_bit(dim, branching, monkeypatch):
     both = torch.cat([even, block(2, 8, centre=8.0, dim=dim)])
     expected = shifted(crowd, both)
     if not branching:
-        monkeypatch.setattr("nmpm.emulator.crowding.is_eager_cpu", lambda _: False)
+        monkeypatch.setattr("nmpm.emulator.engines.torch.crowding.is_eager_cpu", lambda _: False)
     assert shifted(crowd, even).eq(0).all()
     shift = shifted(crowd, both)
     assert torch.equal(shift, expected)

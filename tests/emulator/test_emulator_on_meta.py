@@ -11,7 +11,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
 from nmpm.emulator import Emulator
-from nmpm.emulator.contact import Contact
+from nmpm.emulator.engines.torch.contact import Contact
 from nmpm.emulator.monitor import Monitor
 from nmpm.emulator.rollouts import unroll
 from nmpm.grid import Grid
@@ -98,7 +98,9 @@ def test_each_kind_of_scene_with_all_constraints_and_without(name):
 
 def test_bounds_that_raise_errors_and_a_monitor_read_back_once_each(monkeypatch):
     checked, read = [], []
-    monkeypatch.setattr("nmpm.emulator.advection.check_within_bounds", lambda path, *_: checked.append(path.shape))
+    monkeypatch.setattr(
+        "nmpm.emulator.engines.torch.advection.check_within_bounds", lambda path, *_: checked.append(path.shape)
+    )
     monkeypatch.setattr(Monitor, "read", lambda self: read.append(self._frames))
     emulator, batch = on_meta(WALLS, bounds="error", energy=True), window(WALLS)
     for _ in unroll(emulator.train(), batch.initial, 2):

@@ -9,7 +9,7 @@ import torch
 from nmpm.data.initial_states import lattice
 from nmpm.decoders import Absolute, Acceleration, Blend
 from nmpm.emulator import Emulator, rollout
-from nmpm.emulator.prediction import TensorSteps
+from nmpm.emulator.engines.torch.engine import TorchEngine
 from nmpm.emulator.runtimes import Triton, cuda_graph
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
@@ -78,7 +78,7 @@ def run_again(function, _):
 def triton(monkeypatch, device):
     """Lets emulators take the runtime; without a GPU in Triton's interpreter, and without a graph."""
     pytest.importorskip("triton", reason="triton is not installed")
-    from nmpm.emulator.gpu import steps
+    from nmpm.emulator.engines.triton import steps
 
     monkeypatch.setattr(steps, "_BLOCK", 64)  # more than one program for each scene
     if device.type != "cuda":
@@ -97,7 +97,7 @@ def test_bundles_are_those_of_tensor_operations(name, device):
         context = emulator.context(state)
         for _ in range(2):
             there = emulator.with_runtime("triton")(state, context)
-            here = TensorSteps(emulator).predict(state, context)
+            here = TorchEngine(emulator).predict(state, context)
             real = state.mask
             gap = (there.position - here.position).abs().amax((1, 3)) / emulator.grid.spacing[0]
             assert gap[real].max() < 1e-4
@@ -123,11 +123,11 @@ def test_rollouts_go_on_from_states_of_any_size_and_precision(device):
     [
         (lambda emulator: emulator, "needs a CUDA GPU; the model is on cpu"),
         (lambda emulator: emulator.to("cuda"), "needs Triton"),
-        (lambda _: moving(box(3)), "has no kernels for 3 dimensions: use cuda-graph or eager"),
+        (lambda _: moving(box(3)), "has no kernels for three dimensions: use cuda-graph or eager"),
         (Emulator.double, "torch.float64"),
-        (lambda _: moving(box(), bounds="reflect"), "constraints.bounds reflect"),
-        (lambda _: moving(box(), transfer=Quadratic()), "the transfer Quadratic"),
-        (lambda _: moving(box(evolving=("heat",))), r"fields \(heat\)"),
+        (lambda _: moving(box(), bounds="reflect"), "bounds: reflect"),
+        (lambda _: moving(box(), transfer=Quadratic()), "the transfers Nearest and Quadratic"),
+        (lambda _: moving(box(evolving=("heat",))), "fields"),
     ],
     ids=["cpu", "no Triton", "3-D", "float64", "bounds", "transfer", "fields"],
 )

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from nmpm.data.initial_states import lattice
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
-from nmpm.emulator.fused.call import KernelCall
-from nmpm.emulator.prediction import FusedSteps, TensorSteps, TrainingSteps, steps_for
+from nmpm.emulator.engines import find_engine
+from nmpm.emulator.engines.numba.engine import NumbaEngine
 from nmpm.emulator.rollouts import rollout
 from nmpm.training.losses import TrainingError
 from nmpm.transfer import Linear, Nearest, Quadratic, without_kernels
@@ -36,17 +36,17 @@ def scene_of(dim, walls, materials=1, obstacles=False, slim=False):
     return scene
 
 
-def steps_of(emulator, particles):
-    return type(steps_for(emulator, particles, emulator.solid(particles)))
+def engine_of(emulator, particles):
+    return find_engine(emulator, particles, emulator.solid(particles)).name
 
 
 def predict_both(emulator, particles):
     """A bundle's last positions and velocities in cells, by kernels and by tensor operations."""
     with torch.no_grad():
-        assert steps_of(emulator, particles) is FusedSteps
+        assert engine_of(emulator, particles) == "numba"
         fused = emulator(particles)
         with without_kernels():
-            assert steps_of(emulator, particles) is TensorSteps
+            assert engine_of(emulator, particles) == "torch"
             tensors = emulator(particles)
     spacing = torch.tensor(emulator.grid.spacing)
     return [torch.stack([b.position[:, -1], b.velocity]) / spacing for b in (fused, tensors)]
@@ -171,16 +171,16 @@ def with_threads(numbers, action):
 
 def test_the_number_of_threads_changes_nothing_to_the_bit(monkeypatch):
     scene = box(obstacles=True)
-    for name in ("call.CHUNK", "contact.CHUNK", "path.CHUNK", "rest.CHUNK", "state._CHUNK"):
-        monkeypatch.setattr(f"nmpm.emulator.fused.{name}", 256)
+    for name in ("engine.CHUNK", "contact.CHUNK", "path.CHUNK", "rest.CHUNK", "state._CHUNK"):
+        monkeypatch.setattr(f"nmpm.emulator.engines.numba.{name}", 256)
     emulator = emulator_of(scene, cells=12, **HELD).requires_grad_(False)
     particles = cloud(scene, 3000, 2, statics=20)
-    call = KernelCall(emulator, emulator.kernel_parameters, emulator.context(particles))
+    engine, context = NumbaEngine(emulator, emulator.kernel_parameters), emulator.context(particles)
     output = torch.randn(2, emulator.frames, 2, *emulator.grid.shape)
 
     def move():
-        start = call.rasterise(particles)
-        return call.finish(start, call.path(start, output)).position
+        start = engine.rasterise(particles, context)
+        return engine.land(start, engine.spread(start, engine.fly(start, output, context), context)).position
 
     assert torch.equal(*with_threads((1, 3), move))
 
@@ -231,18 +231,18 @@ def test_a_rollouts_context_follows_what_changes(change):
 def test_what_has_no_kernels_takes_tensor_operations():
     scene, space, particles = box(), box(3), cloud(box(), 10)
     unknown = emulator_of(scene, transfer=type("Own", (Linear,), {})())
-    assert steps_of(emulator_of(scene), particles) is TensorSteps  # the weights want gradients
-    assert steps_of(emulator_of(scene).train(), particles) is TrainingSteps
+    assert engine_of(emulator_of(scene), particles) == "torch"  # the weights want gradients
+    assert engine_of(emulator_of(scene).train(), particles) == "numba training"
     for parts in ({"transfer": Quadratic()}, {"bounds": "reflect"}):
-        assert steps_of(emulator_of(scene, **parts).train(), particles) is TensorSteps
-    assert steps_of(emulator_of(space, cells=8).train(), cloud(space)) is TensorSteps
+        assert engine_of(emulator_of(scene, **parts).train(), particles) == "torch"
+    assert engine_of(emulator_of(space, cells=8).train(), cloud(space)) == "torch"
     with torch.no_grad():
-        assert steps_of(emulator_of(scene), particles) is FusedSteps
-        assert steps_of(emulator_of(scene), particles.double()) is TensorSteps
+        assert engine_of(emulator_of(scene), particles) == "numba"
+        assert engine_of(emulator_of(scene), particles.double()) == "torch"
         for other in (unknown, emulator_of(scene, bounds="error"), unknown.double()):
-            assert steps_of(other, particles) is TensorSteps
+            assert engine_of(other, particles) == "torch"
     moving = dataclasses.replace(particles, velocity=particles.velocity.requires_grad_())
-    assert steps_of(emulator_of(scene).requires_grad_(False), moving) is TensorSteps
+    assert engine_of(emulator_of(scene).requires_grad_(False), moving) == "torch"
 
 
 @pytest.mark.slow
@@ -293,10 +293,10 @@ def check_training(walls, materials, decoder, obstacles, count, seed=0, speed=0.
     if sizes is not None:
         volume = torch.where(particles.mask, torch.tensor(sizes).unsqueeze(1), 1.0)
         particles = dataclasses.replace(particles, volume=volume)
-    assert steps_of(emulator, particles) is TrainingSteps
+    assert engine_of(emulator, particles) == "numba training"
     loss, predicted, gradients = train_once(emulator, particles)
     with without_kernels():
-        assert steps_of(emulator, particles) is TensorSteps
+        assert engine_of(emulator, particles) == "torch"
         tensors = train_once(emulator, particles)
     torch.testing.assert_close(loss, tensors[0], rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(predicted, tensors[1], rtol=0, atol=1e-5)
@@ -321,7 +321,7 @@ def test_training_has_the_same_values_and_gradients(walls, materials, decoder, o
 def test_scenes_may_have_particles_of_a_size_of_their_own_in_training():
     check_training((True, True), 2, Residual(), True, 100, sizes=(0.4, 2.5))
     several = dataclasses.replace(cloud(box(), 10), volume=torch.linspace(1.0, 2.0, 10).expand(1, -1))
-    assert steps_of(emulator_of(box()).train(), several) is TensorSteps
+    assert engine_of(emulator_of(box()).train(), several) == "torch"
 
 
 @pytest.mark.slow
@@ -351,8 +351,8 @@ def test_a_training_step_repeats_and_threads_change_nothing_to_the_bit():
     first, second = (train_once(emulator, particles) for _ in range(2))
     assert torch.equal(first[0], second[0])
     assert all(map(torch.equal, first[2], second[2]))
-    steps = steps_for(emulator, particles, emulator.solid(particles))
-    assert torch.equal(*with_threads((1, 3), lambda: steps.rasterise(particles, emulator.solid(particles))[3]))
+    engine = find_engine(emulator, particles, emulator.solid(particles))
+    assert torch.equal(*with_threads((1, 3), lambda: engine.grid_state(particles, emulator.solid(particles))[3]))
 
 
 @pytest.mark.parametrize("name", ["obstacle", "gravity"])
@@ -361,7 +361,7 @@ def test_gradients_of_obstacles_and_gravity_take_tensor_operations(name):
     emulator, particles = trained(scene), cloud(scene, 30, statics=10)
     leaf = getattr(particles, name).clone().requires_grad_()
     particles = dataclasses.replace(particles, **{name: leaf})
-    assert steps_of(emulator, particles) is TensorSteps
+    assert engine_of(emulator, particles) == "torch"
     emulator(particles).position.square().sum().backward()
     assert leaf.grad.abs().sum() > 0
 

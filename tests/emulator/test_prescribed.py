@@ -288,9 +288,9 @@ def test_two_particles_in_one_place_are_one_of_twice_the_size():
 
 def test_what_has_no_kernels_or_programs_is_refused_with_the_reason():
     moving, opened = emulator_of(PADDLE), emulator_of(box(**OPEN))
-    assert moving.kernel_parameters is None
-    assert opened.kernel_parameters is not None
-    assert emulator_of(box(**OPEN), rest_speed=0.1).kernel_parameters is None
+    assert not moving.engines
+    assert opened.engines
+    assert not emulator_of(box(**OPEN), rest_speed=0.1).engines
     for emulator, what in ((moving, "obstacles that move"), (opened, "open axes")):
         with pytest.raises(ConfigError, match=f"scenes have {what}, which exported files do not carry"):
             Network(emulator)

@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import torch
 from torch import Tensor
 
+from nmpm.emulator.engines import ENGINES
+from nmpm.emulator.engines.rules import MODELS, lacks
 from nmpm.emulator.runtimes.programs import Programs
 from nmpm.emulator.runtimes.runtime import Eager, Runtime, refuse_gradients
 from nmpm.errors import ConfigError
 from nmpm.processors import GridProcessor
-from nmpm.transfer import Linear
 from nmpm.transfer.execution import is_default
 
 if TYPE_CHECKING:
@@ -84,38 +85,25 @@ class Triton(CudaGraph):
     automatic: ClassVar[bool] = False
 
     def unsupported_reason(self, emulator: Emulator) -> str:
-        scene, bounds, parameters = emulator.scene, emulator.constraints.bounds, emulator.kernel_parameters
-        rules = {
-            f"{scene.dim} dimensions": scene.dim != 2,
-            f"fields ({', '.join(scene.fields)})": bool(scene.fields),
-            "obstacles that move": scene.moving_obstacles,
-            "constraints.rest_speed beside open axes": "open" in scene.boundary and emulator.constraints.rest_speed > 0,
-            f"the transfer {type(emulator.transfer).__name__}": type(emulator.transfer) is not Linear,
-            f"constraints.bounds {bounds}": bounds != "stop",
-            f"the decoder {type(emulator.decoder).__name__}, or for bounds so far off": parameters is None,
-            f"{emulator.precision}": emulator.precision != torch.float32,
-            "deterministic algorithms": torch.are_deterministic_algorithms_enabled(),
-        }
         if emulator.device.type != "cuda":
             return f"The runtime triton needs a CUDA GPU; the model is on {emulator.device}."
-        for reason, holds in rules.items():
-            if holds:
-                return f"The runtime triton has no kernels for {reason}: use cuda-graph or eager."
+        missing = lacks("triton", MODELS, emulator.recipe)
+        if emulator.precision != torch.float32:
+            missing.append(f"{emulator.precision}")
+        if torch.are_deterministic_algorithms_enabled():
+            missing.append("deterministic algorithms")
+        if missing:
+            return f"The runtime triton has no kernels for {', '.join(missing)}: use cuda-graph or eager."
         if importlib.util.find_spec("triton") is None:
             return "The runtime triton needs Triton, which comes with torch's builds for CUDA: pip install triton."
         return ""
 
     def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
-        from nmpm.emulator.gpu.steps import TritonSteps
-
-        if emulator.kernel_parameters is None:
-            raise ConfigError(self.unsupported_reason(emulator))
         if particles.volume is not None:
             raise ConfigError(
                 "The runtime triton has no kernels for particles of several sizes: use cuda-graph or eager."
             )
-        steps = TritonSteps(emulator, emulator.kernel_parameters)
-        return steps.predict(particles.map(Tensor.contiguous), context)
+        return ENGINES["triton"](emulator).predict(particles, context)
 
 
 class Recorded:

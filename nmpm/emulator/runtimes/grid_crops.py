@@ -187,7 +187,7 @@ def predict_on_crops(
             inputs = inputs.contiguous(memory_format=torch.channels_last)
         parts += zip(batch, network(inputs), strict=True)
     frames, channels = parts[0][1].shape[:2]
-    # One row of values for each node, as the kernels of `nmpm.emulator.fused` read them.
+    # One row of values for each node, as the kernels of `nmpm.emulator.engines.numba` read them.
     rows = parts[0][1].new_full((len(grid), *grid.shape[2:], frames, channels), math.nan)
     output = rows.movedim((-2, -1), (1, 2))
     for crop, values in parts:

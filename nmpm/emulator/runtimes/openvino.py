@@ -1,7 +1,7 @@
 """OpenVINO on a CPU: the network compiled for one shape of the grid, in float32 or bfloat16.
 
 Everything around the network stays as it is. Inputs and outputs are shared, not copied, where their memory already has
-the order of the program's, which is that of the kernels of `nmpm.emulator.fused`: channels last.
+the order of the program's, which is that of the kernels of `nmpm.emulator.engines.numba`: channels last.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nmpm.emulator.fused.parameters import Array, KernelParameters
+from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
 
 
 def as_array(tensor: Tensor) -> Any:

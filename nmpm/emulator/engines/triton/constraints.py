@@ -1,13 +1,13 @@
 """Kernels that lead paths off obstacles and out of overfull cells, in Triton; arrays as in `motion`.
 
-They compute what `nmpm.emulator.contact` and `crowding` compute.
+They compute what the torch engine's `contact` and `crowding` compute.
 """
 
 import triton
 import triton.language as tl
 
-from nmpm.emulator.gpu.grid import SIZES, find_nodes, interpolate
-from nmpm.emulator.gpu.motion import SUMS, confine, load, store
+from nmpm.emulator.engines.triton.grid import SIZES, find_nodes, interpolate
+from nmpm.emulator.engines.triton.motion import SUMS, confine, load, store
 
 
 @triton.jit

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from nmpm._support.jit import jit
 from nmpm._support.threads import map_ranges, split
-from nmpm.emulator.fused.parameters import Array, KernelParameters
-from nmpm.transfer.fused.scatter import scatter
+from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
+from nmpm.emulator.engines.numba.scatter import scatter
 
 _CHUNK = 2**16  # particles; each chunk has a grid of its own, so that sums do not depend on the number of threads
 _BLOCK = 64  # nodes
@@ -20,7 +20,7 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 
 class StartArrays(NamedTuple):
-    """Particles and grid state at a bundle's start, see `nmpm.emulator.fused`; of B scenes: with a first axis (B,)."""
+    """Particles and grid state at a bundle's start, see `numba`; of B scenes: with a first axis (B,)."""
 
     cells: Array
     velocity: Array

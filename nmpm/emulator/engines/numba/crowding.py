@@ -1,4 +1,4 @@
-"""Overfull cells spread into the room around them: as `nmpm.emulator.crowding` and `Advection.uncrowded_path` compute.
+"""Overfull cells spread into the room around them: as the torch engine's `crowding` computes.
 
 Nodes are numbered as in the grid state; along an axis they lie `stride` apart.
 """
@@ -12,14 +12,14 @@ import numpy as np
 
 from nmpm._support.jit import jit
 from nmpm._support.threads import map_ranges, split
-from nmpm.emulator.contact import SURFACE
-from nmpm.emulator.crowding import MAX_SHIFT, SWEEPS
-from nmpm.emulator.fused.parameters import Array, KernelParameters
-from nmpm.emulator.fused.path import BLOCK, CHUNK, ROUNDING, confine, energy, fill_mass
-from nmpm.emulator.fused.solids import FreeVolume, SolidCache, depths
-from nmpm.emulator.fused.state import StartArrays
-from nmpm.transfer.fused.gather import gather
-from nmpm.transfer.fused.scatter import scatter
+from nmpm.emulator.engines.numba.gather import gather
+from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
+from nmpm.emulator.engines.numba.path import BLOCK, CHUNK, ROUNDING, confine, energy, fill_mass
+from nmpm.emulator.engines.numba.scatter import scatter
+from nmpm.emulator.engines.numba.solids import FreeVolume, SolidCache, depths
+from nmpm.emulator.engines.numba.state import StartArrays
+from nmpm.emulator.engines.torch.contact import SURFACE
+from nmpm.emulator.engines.torch.crowding import MAX_SHIFT, SWEEPS
 
 _COUNTED = 2**16  # particles of a chunk that is counted: each has a grid of its own
 _LINEAR = (0, 0)

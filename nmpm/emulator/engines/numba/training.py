@@ -8,6 +8,7 @@ the kernels.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,14 +18,42 @@ from torch.autograd.function import once_differentiable
 
 from nmpm._support.jit import jit
 from nmpm._support.threads import for_each
-from nmpm.emulator.fused.arrays import as_array, as_copy, as_grid, check_materials, material_rows
-from nmpm.emulator.fused.parameters import Array, KernelParameters
-from nmpm.emulator.fused.path import find_path
-from nmpm.emulator.fused.state import StartArrays, output_array, rasterise, unpack
-from nmpm.transfer.fused.gather import gather_adjoint
-from nmpm.transfer.fused.scatter import scatter_adjoint
+from nmpm.emulator.bundle import RolloutContext
+from nmpm.emulator.engines.numba.arrays import as_array, as_copy, as_grid, check_materials, material_rows
+from nmpm.emulator.engines.numba.gather import gather_adjoint
+from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
+from nmpm.emulator.engines.numba.path import find_path
+from nmpm.emulator.engines.numba.scatter import scatter_adjoint
+from nmpm.emulator.engines.numba.state import StartArrays, output_array, rasterise, unpack
+from nmpm.emulator.engines.torch.engine import TorchEngine
+from nmpm.emulator.engines.torch.start import BundleStart
+from nmpm.particles import Particles, scene_volumes
 
 ZERO, ONE = np.float32(0), np.float32(1)
+
+
+@dataclass(frozen=True)
+class NumbaTraining(TorchEngine):
+    """The torch engine with kernels for p2g and the path, both with gradients, for trainings on a CPU."""
+
+    parameters: KernelParameters
+    name = "numba training"
+
+    def grid_state(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        given = (particles.position, particles.velocity, particles.gravity, particles.material, particles.mask)
+        cells, velocity, gravity, state = Rasterise.apply(self.parameters, *given, solid)  # type: ignore[no-untyped-call]
+        if (volume := particles.volume) is not None and (of_scene := scene_volumes(volume, particles.mask)) is not None:
+            factor, (first, end) = state.new_ones(state.shape[:2]), self.parameters.volume_channels
+            factor[:, first:end] = of_scene.unsqueeze(1)
+            state = state * factor.reshape(*factor.shape, *(1,) * (state.dim() - 2))
+        return cells, velocity, gravity, state
+
+    def path(self, start: BundleStart, output: Tensor, context: RolloutContext) -> Tensor:  # noqa: ARG002 (no constraint acts)
+        path: Tensor = FreePath.apply(  # type: ignore[no-untyped-call]  # (torch's stubs)
+            self.parameters, start.cells, start.velocity, start.gravity, start.material, start.mask, start.state,
+            output, self.emulator.output_scale,
+        )  # fmt: skip
+        return path
 
 
 class Rasterise(torch.autograd.Function):
@@ -76,7 +105,7 @@ class FreePath(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, parameters: KernelParameters, *tensors: Tensor) -> Tensor:
-        """(B, m, N, D) positions in cells; tensors as of `nmpm.emulator.bundle.BundleStart`."""
+        """(B, m, N, D) positions in cells; tensors as of `BundleStart`, and the network's output and scale."""
         start, fields = _to_arrays(parameters, *tensors)
         check_materials(parameters, start.material)
         path = np.empty((len(fields), fields.shape[1], *start.cells.shape[1:]), np.float32)
@@ -118,7 +147,7 @@ def _to_arrays(
     parameters: KernelParameters, cells: Tensor, velocity: Tensor, gravity: Tensor, material: Tensor, mask: Tensor,
     state: Tensor, output: Tensor, scale: Tensor,
 ) -> tuple[StartArrays, Array]:  # fmt: skip
-    """The start, and the fields (B, m, size, C) of an output; tensors as of `nmpm.emulator.bundle.BundleStart`."""
+    """The start, and the fields (B, m, size, C) of an output; tensors as of `FreePath.forward`."""
     rows = as_array(state.movedim(1, -1)).reshape(len(cells), -1, state.shape[1])
     kinds, pull = material_rows(material, len(parameters.mass)), as_array(gravity)[:, 0]
     fields = np.empty((*output.shape[:2], rows.shape[1], output.shape[2]), np.float32)

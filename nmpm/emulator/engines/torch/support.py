@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nmpm.emulator.contact import SURFACE
+from nmpm.emulator.engines.torch.contact import SURFACE
 from nmpm.grid import Grid
 from nmpm.scene import Scene
 from nmpm.transfer.execution import is_eager_cpu

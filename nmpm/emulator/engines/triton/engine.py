@@ -1,7 +1,8 @@
-"""The steps of a call on a CUDA GPU: which kernel runs when, on which memory."""
+"""The engine of Triton kernels for rollouts on a CUDA GPU: which kernel runs when, on which memory."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,14 +10,16 @@ import torch
 import triton
 from torch import Tensor
 
-from nmpm.emulator.bundle import BundleStart, RolloutContext
+from nmpm.emulator.bundle import Bundle, RolloutContext
 from nmpm.emulator.constraints import FREE_FALL_SHARE, mass_shares
-from nmpm.emulator.contact import SURFACE, obstacle_share
-from nmpm.emulator.crowding import CLOSED, MAX_SHIFT, SWEEPS
-from nmpm.emulator.fused.parameters import KernelParameters
-from nmpm.emulator.gpu import constraints, grid, motion
-from nmpm.emulator.prediction import TensorSteps
-from nmpm.emulator.support import ENOUGH, MAX_DROP, REACH
+from nmpm.emulator.engines.engine import Flight
+from nmpm.emulator.engines.numba.parameters import KernelParameters
+from nmpm.emulator.engines.torch.contact import SURFACE, obstacle_share
+from nmpm.emulator.engines.torch.crowding import CLOSED, MAX_SHIFT, SWEEPS
+from nmpm.emulator.engines.torch.engine import TorchEngine
+from nmpm.emulator.engines.torch.start import BundleStart
+from nmpm.emulator.engines.torch.support import ENOUGH, MAX_DROP, REACH
+from nmpm.emulator.engines.triton import constraints, grid, motion
 from nmpm.particles import Particles
 
 _BLOCK = 256
@@ -27,12 +30,16 @@ _COLUMNS = 16
 
 
 @dataclass(frozen=True)
-class TritonSteps(TensorSteps):
-    """The steps as kernels in Triton; only for what `nmpm.emulator.runtimes.Triton` takes. States are contiguous."""
+class TritonEngine(TorchEngine):
+    """Kernels in Triton around the network, for rollouts on a CUDA GPU."""
 
     parameters: KernelParameters
+    name = "triton"
 
-    def rasterise(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def predict(self, particles: Particles, context: RolloutContext) -> Bundle:
+        return super().predict(particles.map(Tensor.contiguous), context)
+
+    def grid_state(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         params, materials = self.parameters, len(self.parameters.mass)
         cells, velocity, gravity = (values.contiguous() for values in self.emulator.in_cells(particles))
         sums = cells.new_zeros(len(cells), *params.shape, 3 * materials)
@@ -47,19 +54,20 @@ class TritonSteps(TensorSteps):
             parts.append(gravity.unsqueeze(1).expand(-1, *params.shape, -1))
         return cells, velocity, gravity, torch.cat(parts, dim=-1).movedim(-1, 1)
 
-    def path(self, start: BundleStart, context: RolloutContext) -> Tensor:
-        params, (tiles, batch), frames = self.parameters, _programs(start.cells), start.output.shape[1]
+    def path(self, start: BundleStart, output: Tensor, context: RolloutContext) -> Tensor:
+        params, (tiles, batch), frames = self.parameters, _programs(start.cells), output.shape[1]
         path = start.cells.new_empty(batch, frames + 1, start.cells.shape[1], 2)
         sums = path.new_empty(batch, frames, tiles, motion.SUMS.value)
         share, weight = self._share(context), self._weight(start)
-        self._advance(start, weight, context.budget, path, sums)
+        self._advance(start, self.velocities(output), weight, context.budget, path, sums)
         if params.obstacles and params.solids:
             self._hold(path, weight, share, sums)
         if params.rest_speed:
             self._rest(start, path, share)
         return path[:, 1:]
 
-    def uncrowded(self, start: BundleStart, path: Tensor, context: RolloutContext) -> Tensor:
+    def spread(self, start: BundleStart, flight: Flight[Tensor], context: RolloutContext) -> Flight[Tensor]:
+        path = flight.path
         params, (tiles, batch), frames = self.parameters, _programs(start.cells), path.shape[1]
         weight, count = self._weight(start), path.shape[2]
         path = torch.cat([start.cells.unsqueeze(1), path], dim=1)
@@ -74,7 +82,7 @@ class TritonSteps(TensorSteps):
             constraints.land[tiles, batch](
                 path, spreads, energies, context.budget, frames, count, tiles, BLOCK=_BLOCK, TILES=_power(tiles)
             )
-        return spreads[:, 1:]
+        return dataclasses.replace(flight, path=spreads[:, 1:])
 
     @property
     def _axes(self) -> dict[str, int]:
@@ -97,8 +105,10 @@ class TritonSteps(TensorSteps):
         walls = self.emulator.walls
         return obstacle_share(context.solid, walls).contiguous() if self.parameters.obstacles else walls
 
-    def _advance(self, start: BundleStart, weight: Tensor, budget: Tensor | None, path: Tensor, sums: Tensor) -> None:
-        params, fields, (batch, frames, tiles, _) = self.parameters, start.fields, sums.shape
+    def _advance(
+        self, start: BundleStart, fields: Tensor, weight: Tensor, budget: Tensor | None, path: Tensor, sums: Tensor
+    ) -> None:
+        params, (batch, frames, tiles, _) = self.parameters, sums.shape
         kept, of_grid, fall, keeps = map(float, params.decoder)
         state, carried = start.state.movedim(1, -1).contiguous(), torch.empty_like(start.cells)
         for frame in range(frames + 1):
@@ -125,8 +135,9 @@ class TritonSteps(TensorSteps):
         held = start.mask.new_empty(batch, params.size, dtype=torch.int8)
         (left, right), (down, up) = params.floors.tolist()
         options: dict[str, Any] = {"OBSTACLES": params.obstacles, "SURFACE": SURFACE} | self._axes
+        filled = start.filled(len(params.mass)).contiguous()
         grid.support[triton.cdiv(longest, _COLUMNS), batch](
-            start.filled.contiguous(), share, start.gravity, held, **options, LEFT=left, RIGHT=right, DOWN=down, UP=up,
+            filled, share, start.gravity, held, **options, LEFT=left, RIGHT=right, DOWN=down, UP=up,
             REACH=REACH, ENOUGH=ENOUGH, ROWS=_power(longest), COLUMNS=_COLUMNS,
         )  # fmt: skip
         motion.rest[_programs(start.cells)](

@@ -1,4 +1,4 @@
-"""Resting particles stay where something holds them up, and fall elsewhere: as `nmpm.emulator.support` computes."""
+"""Resting particles stay where something holds them up, else fall: as the torch engine's `support` computes."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from nmpm._support.jit import jit
 from nmpm._support.threads import map_ranges, split
 from nmpm.emulator.constraints import FREE_FALL_SHARE
-from nmpm.emulator.contact import SURFACE
-from nmpm.emulator.fused.parameters import Array, KernelParameters
-from nmpm.emulator.fused.path import CHUNK, confine
-from nmpm.emulator.fused.solids import cell_index, depths, stride_of, widen
-from nmpm.emulator.fused.state import StartArrays
-from nmpm.emulator.support import ENOUGH, MAX_DROP, REACH
+from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
+from nmpm.emulator.engines.numba.path import CHUNK, confine
+from nmpm.emulator.engines.numba.solids import cell_index, depths, stride_of, widen
+from nmpm.emulator.engines.numba.state import StartArrays
+from nmpm.emulator.engines.torch.contact import SURFACE
+from nmpm.emulator.engines.torch.support import ENOUGH, MAX_DROP, REACH
 
 ZERO, HALF = np.float32(0), np.float32(0.5)
 _ENOUGH, _SURFACE, _MAX_DROP = np.float32(ENOUGH), np.float32(SURFACE), np.float32(MAX_DROP)
@@ -39,7 +39,7 @@ def bring_to_rest(start: StartArrays, parameters: KernelParameters, obstacle: Ar
 def find_support(state: Any, channels: Any, obstacle: Any, gravity: Any, grid: Any, floors: Any, held: Any) -> Any:
     """Fill in `held` (size,) bool: whether the material in each cell is held up.
 
-    `channels` are the state's volume fractions, from and to; `floors` (D, 2) from `nmpm.emulator.support.floor_rows`.
+    `channels` are the state's volume fractions, from and to; `floors` (D, 2) of `support.floor_rows`.
     """
     shape, wraps = grid
     axis, largest = 0, ZERO
@@ -115,7 +115,7 @@ def stop_resting(
 
 @jit
 def _fill_drops(gravity: Any, drops: Any) -> Any:
-    """Fill in (m, D) what a particle falls from rest until each frame, as `nmpm.emulator.support.drops`."""
+    """Fill in (m, D) what a particle falls from rest until each frame, as the torch engine's `support.drops`."""
     frames, square = len(drops), ZERO
     for d in range(len(gravity)):
         square += gravity[d] * gravity[d]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.jit import jit
-from nmpm.transfer.fused.nodes import ONE, ZERO, linear_nodes, stencil, weight_slope
+from nmpm.emulator.engines.numba.nodes import ONE, ZERO, linear_nodes, stencil, weight_slope
 
 
 @jit

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from nmpm.emulator.bundle import BundleStart
 from nmpm.emulator.constraints import (
     BOUNDS,
     affordable,
@@ -22,9 +21,10 @@ from nmpm.emulator.constraints import (
     energy,
     mass_shares,
 )
-from nmpm.emulator.contact import SURFACE, Contact, obstacle_share
-from nmpm.emulator.crowding import Crowding
-from nmpm.emulator.support import Support
+from nmpm.emulator.engines.torch.contact import SURFACE, Contact, obstacle_share
+from nmpm.emulator.engines.torch.crowding import Crowding
+from nmpm.emulator.engines.torch.start import BundleStart
+from nmpm.emulator.engines.torch.support import Support
 from nmpm.transfer.execution import is_eager_cpu
 from nmpm.transfer.linear import linear_g2p
 
@@ -55,17 +55,17 @@ class Advection:
 
     emulator: Emulator
 
-    def free_path(self, start: BundleStart) -> Tensor:
+    def free_path(self, start: BundleStart, fields: Tensor) -> Tensor:
         """(B, m, N, D) positions by the network's velocities alone, within the bounds; raises as `constrained_path`."""
-        return self._check_bounds(start, self._free_path(self._take_off(start)))
+        return self._check_bounds(start, self._free_path(self._take_off(start, fields)))
 
-    def constrained_path(self, start: BundleStart, solid: Tensor, budget: Tensor | None) -> Tensor:
+    def constrained_path(self, start: BundleStart, fields: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
         """(B, m, N, D) positions that obey the constraints.
 
         Solid and budget are those of the `RolloutContext`. Raises DataError if a particle leaves the bounds by more
         than a cell, and their rule is "error".
         """
-        moving = self._take_off(start)
+        moving = self._take_off(start, fields)
         path = self._free_path(moving) if budget is None else self._within_energy(moving, budget)
         if self.emulator.constraints.solids and self.emulator.scene.obstacles:
             path = self._keep_clear(start, path, solid)
@@ -116,9 +116,8 @@ class Advection:
         values: Tensor = by_material.gather(2, index).squeeze(2)
         return values
 
-    def _take_off(self, start: BundleStart) -> MovingParticles:
+    def _take_off(self, start: BundleStart, fields: Tensor) -> MovingParticles:
         """The velocities that particles keep, and their shares of their scene's mass."""
-        fields = start.fields
         smoothed = self.gather(start.state[:, : fields.shape[2]], start.cells, start.material)
         carried = self.emulator.decoder.carried_velocity(start.velocity, smoothed)
         share = mass_shares(self.emulator.scene, start.material, start.volume, start.cells.dtype)
@@ -182,7 +181,9 @@ class Advection:
         if is_eager_cpu(still) and not bool(still.any()):
             return path
         obstacle = obstacle_share(solid, self.emulator.walls) if self.emulator.scene.obstacles else None
-        support = Support(start.filled, obstacle, self.emulator.scene, self.emulator.grid)
+        support = Support(
+            start.filled(len(self.emulator.scene.materials)), obstacle, self.emulator.scene, self.emulator.grid
+        )
         held = support.holds(start.cells, start.gravity)[:, None, :, None]
         fallen = self._confine(support.fall(start.cells, start.gravity, path.shape[1]))
         return torch.where(still[:, None, :, None], torch.where(held, start.cells.unsqueeze(1), fallen), path)

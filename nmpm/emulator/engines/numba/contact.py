@@ -1,4 +1,4 @@
-"""Paths that do not lead into obstacles: as `nmpm.emulator.contact` computes on a CPU.
+"""Paths that do not lead into obstacles: as the torch engine's `contact` computes on a CPU.
 
 Particles that touch an obstacle are marked, then only those are followed piece by piece, at most half a cell each.
 """
@@ -13,13 +13,13 @@ import numpy as np
 
 from nmpm._support.jit import jit
 from nmpm._support.threads import map_ranges, split
-from nmpm.emulator.contact import SURFACE
-from nmpm.emulator.fused.parameters import Array, KernelParameters
-from nmpm.emulator.fused.path import BLOCK, CHUNK, confine
-from nmpm.emulator.fused.solids import SolidCache, cell_index, depths
-from nmpm.emulator.fused.state import StartArrays
+from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
+from nmpm.emulator.engines.numba.path import BLOCK, CHUNK, confine
+from nmpm.emulator.engines.numba.solids import SolidCache, cell_index, depths
+from nmpm.emulator.engines.numba.state import StartArrays
+from nmpm.emulator.engines.torch.contact import SURFACE
 
-PIECE, EVEN = 0.5, 1e-5  # as in `nmpm.emulator.contact`
+PIECE, EVEN = 0.5, 1e-5  # as in the torch engine's `contact`
 CLEAR, TOUCHES, STUCK = 0, 1, 2
 
 _MAX_PIECES = 64

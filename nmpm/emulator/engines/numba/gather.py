@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.jit import jit
-from nmpm.transfer.fused.nodes import ONE, ZERO, linear_nodes, stencil, weight_slope
+from nmpm.emulator.engines.numba.nodes import ONE, ZERO, linear_nodes, stencil, weight_slope
 
 index = np.uint64
 """Of what is not negative: Numba checks signed indices for counting from the end, which costs a quarter of the time."""

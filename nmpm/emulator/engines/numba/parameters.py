@@ -8,11 +8,10 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from nmpm.decoders import Absolute, Acceleration, Blend, Decoder, Flip, Residual
-from nmpm.emulator.support import floor_rows
+from nmpm.emulator.engines.torch.support import floor_rows
 from nmpm.transfer import Linear, Nearest, Quadratic, Transfer
 
 if TYPE_CHECKING:
@@ -22,7 +21,7 @@ Array = NDArray[Any]
 
 _P2G_NODES: Mapping[type[Transfer], int] = MappingProxyType({Nearest: 1, Linear: 2, Quadratic: 3})
 _G2P_NODES: Mapping[type[Transfer], int] = MappingProxyType({Nearest: 2, Linear: 2, Quadratic: 3})
-"""Nodes along an axis. Affine transfers have no kernels; subclasses may do something else, so exactly these count."""
+"""Nodes along an axis."""
 
 _DECODERS: Mapping[type[Decoder], Callable[[Any], tuple[float, ...]]] = MappingProxyType(
     {
@@ -43,7 +42,7 @@ class KernelParameters:
     Args:
         shape, wraps: Cells along each axis, and whether it is periodic.
         box: (2, D) the grid's lower corner and the cells' widths, in domain length.
-        bounds, ratio: As in `nmpm.emulator.fused`.
+        bounds, ratio: As in `nmpm.emulator.engines.numba`.
         grid, p2g_grid, g2p_grid: Shape and periodic axes, with as many steps as the kernel has nodes along an axis.
         size: Number of cells.
         particle_volume: In cells.
@@ -57,11 +56,8 @@ class KernelParameters:
         rest_speed: Cells per frame; 0 for none.
         obstacles: Whether there can be obstacles.
         solids: Whether particles must keep clear of them.
-        floors: (D, 2) int64, as `nmpm.emulator.support.floor_rows`.
+        floors: (D, 2) int64, as the torch engine's `support.floor_rows`.
         density_cap: Volume fraction above which cells are overfull; 0 for no cap.
-        trains: Whether trainings take the kernels with gradients, see `nmpm.emulator.fused.autograd`. Not in three
-            dimensions: beside them torch's strided 3-D convolutions in bfloat16 sometimes got weights' gradients of
-            unset memory (torch 2.13, CPU with AVX-512), which they do not beside tensor operations.
     """
 
     shape: tuple[int, ...]
@@ -85,19 +81,12 @@ class KernelParameters:
     solids: bool
     floors: Array
     density_cap: float
-    trains: bool
 
 
-def kernel_parameters(recipe: EmulatorRecipe) -> KernelParameters | None:
-    """The parameters; None if the emulator has parts without kernels, or lies too far from the origin for float32."""
+def kernel_parameters(recipe: EmulatorRecipe) -> KernelParameters:
+    """The parameters of a recipe of which engines with kernels compute all, see `nmpm.emulator.engines.rules`."""
     scene, grid, constraints = recipe.scene, recipe.grid, recipe.constraints
     transfer, decoder = type(recipe.transfer), type(recipe.decoder)
-    if scene.dim == 1 or scene.fields or scene.moving_obstacles or not grid.resolves(torch.float32):
-        return None
-    if "open" in scene.boundary and constraints.rest_speed:
-        return None
-    if transfer not in _P2G_NODES or decoder not in _DECODERS or constraints.bounds not in ("stop", "reflect"):
-        return None
     spacing = np.array(grid.spacing)
     low, high = (np.array(scene.bounds).T - np.array(grid.lower)) / spacing
     low, high = np.where(scene.confined, low, -np.inf), np.where(scene.confined, high, np.inf)
@@ -126,5 +115,4 @@ def kernel_parameters(recipe: EmulatorRecipe) -> KernelParameters | None:
         solids=constraints.solids,
         floors=np.array(floor_rows(scene, grid), np.int64),
         density_cap=constraints.density_cap,
-        trains=scene.dim == 2 and transfer is Linear and constraints.bounds == "stop",
     )

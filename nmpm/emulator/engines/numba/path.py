@@ -1,4 +1,4 @@
-"""Paths of particles through a bundle, frame by frame, free or within an energy: as `nmpm.emulator.advection` computes.
+"""Paths through a bundle, frame by frame, free or within an energy: as the torch engine's `advection` computes.
 
 The free path is tried first, and kept up to the first frame that exceeds the energy, if any does.
 """
@@ -13,9 +13,9 @@ import numpy as np
 
 from nmpm._support.jit import jit, jit_sum
 from nmpm._support.threads import map_ranges, split
-from nmpm.emulator.fused.parameters import Array, KernelParameters
-from nmpm.emulator.fused.state import StartArrays
-from nmpm.transfer.fused.gather import gather
+from nmpm.emulator.engines.numba.gather import gather
+from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
+from nmpm.emulator.engines.numba.state import StartArrays
 
 CHUNK = 2**14
 """Particles that a thread treats at once; sums do not depend on the number of threads."""

@@ -9,12 +9,12 @@ import numpy as np
 from torch import Tensor
 
 from nmpm._support.jit import jit
-from nmpm.emulator.contact import SURFACE, obstacle_share
-from nmpm.emulator.crowding import CLOSED
-from nmpm.emulator.fused.arrays import as_array
-from nmpm.emulator.fused.parameters import Array, KernelParameters
-from nmpm.transfer.fused.gather import bilinear
-from nmpm.transfer.fused.nodes import linear_nodes
+from nmpm.emulator.engines.numba.arrays import as_array
+from nmpm.emulator.engines.numba.gather import bilinear
+from nmpm.emulator.engines.numba.nodes import linear_nodes
+from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
+from nmpm.emulator.engines.torch.contact import SURFACE, obstacle_share
+from nmpm.emulator.engines.torch.crowding import CLOSED
 
 FAR = 16
 """Cells beyond which clearances are not told apart."""
@@ -42,7 +42,7 @@ class SolidCache:
     """The solids of one scene.
 
     Args:
-        obstacle: (size,), see `nmpm.emulator.fused`.
+        obstacle: (size,), see `nmpm.emulator.engines.numba`.
         clearance: (size,) cells, from `fill_clearance`; empty where there are no obstacles.
         free: Where crowding is limited.
     """

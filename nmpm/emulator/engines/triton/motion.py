@@ -1,4 +1,4 @@
-"""Kernels that move particles through a bundle, in Triton: what `nmpm.emulator.advection` computes.
+"""Kernels that move particles through a bundle, in Triton: what the torch engine's `advection` computes.
 
 Paths are (B, m + 1, N, 2) in cells; their first frame is the start. Of particles there are `weight` (B, N), shares of
 the scene's mass, 0 for padding; of scenes `gravity` (B, 2). A program treats a block of particles in the scene
@@ -9,7 +9,7 @@ program that needs them: in a fixed order, and without waiting within a launch.
 import triton
 import triton.language as tl
 
-from nmpm.emulator.gpu.grid import SIZES, interpolate
+from nmpm.emulator.engines.triton.grid import SIZES, interpolate
 
 SUMS = tl.constexpr(6)
 """Of each block and frame: what gravity's potential would give if nobody moved; kinetic energy of the particles that

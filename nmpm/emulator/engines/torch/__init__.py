@@ -1,0 +1,1 @@
+"""The engine of tensor operations: every feature, device and precision, with gradients; traced for exports."""
