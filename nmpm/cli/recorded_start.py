@@ -66,7 +66,8 @@ class RecordedStart:
         stated = MatchOptions.read(options.materials, options.stride, options.strict)
         if stated.stride is None and is_of_kind(model.scene, metadata, split, index):
             warn_of_ignored(model.scene, metadata.fields)
-            window = collate([SplitRecordings(split, metadata, model.scene)[index]], model.scene)
+            plain = Reading(model.scene)
+            window = collate([SplitRecordings(split, metadata, plain)[index]], plain)
             return cls(model, window, window, model.scene)
         beside = path == split.path and (path.parent / METADATA_FILE).is_file()
         data = Dataset(FolderSource(path.parent if beside else path, Options(family)))
@@ -74,7 +75,7 @@ class RecordedStart:
         sys.stdout.write(describe(match, model.name))
         scene = dataclasses.replace(data.scene, dt=data.scene.dt * match.reading.every)
         window, written = (
-            collate([SplitRecordings(split, metadata, data.scene, reading=reading)[index]], reading.scene)
+            collate([SplitRecordings(split, metadata, reading)[index]], reading)
             for reading in (match.reading, Reading(scene, every=match.reading.every))
         )
         return cls(model.matched(match), window, written, scene, match.reading.between)

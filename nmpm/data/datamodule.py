@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -81,7 +82,6 @@ class TrajectoryDataModule(LightningDataModule):
     Attributes:
         validated: Trajectories, the first of the valid split, that validations of a training use where `limit_eval`
             does not say it; None before that is decided, and for all. Kept in checkpoints.
-        reading: The same as a `Reading`, whose frames windows and `horizon` then have; None for data as they are.
 
     Raises:
         ConfigError: if neither `path` nor `name` is given, options contradict each other, or a number is not positive.
@@ -125,7 +125,8 @@ class TrajectoryDataModule(LightningDataModule):
             smooth=smooth,
         )
         self.data_source = make_source(path, name, source, options, generate)
-        self.reading = None if reading is None else from_plain(Reading, reading, "data.reading")
+        if reading is not None:
+            self.reading = from_plain(Reading, reading, "data.reading")
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):
             if value is not None and value < 1:
                 raise ConfigError(f"{key} = {value} must be at least 1.")
@@ -141,10 +142,15 @@ class TrajectoryDataModule(LightningDataModule):
         # Lightning's default iterates over the endless training batches.
         return f"{type(self).__name__}({self.data_source}, horizon={self.horizon}, batch_size={self.batch_size})"
 
+    @cached_property
+    def reading(self) -> Reading:
+        """How the data are read: as they are, until another is assigned; in its frames are windows and `horizon`."""
+        return Reading(self.data_source.scene)
+
     @property
     def scene(self) -> Scene:
         """The scene of the dataset, as it is read; for an embedded dataset nothing is simulated."""
-        return self.data_source.scene if self.reading is None else self.reading.scene
+        return self.reading.scene
 
     def recordings(self, name: str) -> SplitRecordings:
         """The trajectories of the split "train", "valid" or "test"; raises a DataError if its file is missing."""

@@ -80,11 +80,11 @@ def _with_parts(plain: Mapping[str, Any], change: Callable[[Any], Any]) -> dict[
     parts = plain.get("parts")
     if not isinstance(parts, list | tuple):
         return dict(plain)
-    is_part = [isinstance(part, dict) and "preset" in part for part in parts]
-    changed = [
-        part | {"preset": change(part["preset"])} if yes else part for part, yes in zip(parts, is_part, strict=True)
-    ]
-    return {**plain, "parts": changed}
+    return {**plain, "parts": [_with_preset(part, change) for part in parts]}
+
+
+def _with_preset(part: Any, change: Callable[[Any], Any]) -> Any:
+    return part | {"preset": change(part["preset"])} if isinstance(part, dict) and "preset" in part else part
 
 
 def _described(part: Any) -> Any:

@@ -30,7 +30,7 @@ class EvaluatedModule(LightningModule):
             numbers change results by rounding.
         threads: How many threads compute them; None for one each. Changes no result.
         compiled: Whether torch compiles the network, so that batches are not computed in parts.
-        reading: How the data are read for the emulator; errors then count frames of the data.
+        reading: How the data are read for the emulator; errors count frames of the data.
     """
 
     def __init__(self, emulator: Emulator, horizon: int, metrics: Sequence[RolloutMetric] | None) -> None:
@@ -39,7 +39,7 @@ class EvaluatedModule(LightningModule):
         self.parts: int | None = None
         self.threads: int | None = None
         self.compiled = False
-        self.reading: Reading | None = None
+        self.reading = Reading(emulator.scene)
         reported = [MSE()] if metrics is None else list(metrics)
         cheap = [metric for metric in reported if metric.cheap]
         self.valid_errors = Comparison(emulator.scene, cheap, emulator.frames)
@@ -47,9 +47,10 @@ class EvaluatedModule(LightningModule):
 
     def setup(self, stage: str) -> None:  # noqa: ARG002
         """Adopt the datamodule's reading."""
-        self.reading = getattr(getattr(self.trainer, "datamodule", None), "reading", None)
+        plain = Reading(self.emulator.scene)
+        self.reading = getattr(getattr(self.trainer, "datamodule", None), "reading", plain)
         for errors in (self.valid_errors, self.test_errors):
-            errors.count_every(1 if self.reading is None else self.reading.every)
+            errors.count_every(self.reading.every)
 
     def validation_step(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
         predicted = self._predict(batch)
@@ -95,8 +96,8 @@ class EvaluatedModule(LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         errors = self.valid_errors.compute()
-        every, between = (1, 1) if self.reading is None else (self.reading.every, self.reading.between)
-        overall = overall_error(errors, max(1, self.horizon * every // between))  # in frames of the data
+        horizon = self.horizon * self.reading.every // self.reading.between  # in frames of the data
+        overall = overall_error(errors, max(1, horizon))
         self.log_dict({f"valid/{name}": value for name, value in (errors | {OVERALL: overall}).items()})
 
     def on_test_epoch_end(self) -> None:

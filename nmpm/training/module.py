@@ -287,7 +287,7 @@ class EmulatorModule(EvaluatedModule):
         """Number of bundles that a step unrolls once this share of the training is over; one frame is observed."""
         if progress >= self.unroll_growth:
             return self.unroll
-        least = 1 if self.reading is None else math.ceil(self.reading.between / self.emulator.frames)
+        least = math.ceil(self.reading.between / self.emulator.frames)
         return max(min(least, self.unroll), 1 + int((self.unroll - 1) * progress / self.unroll_growth))
 
     def _progress(self) -> float:

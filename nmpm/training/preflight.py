@@ -201,7 +201,7 @@ def _try_metrics(errors: Comparison, recordings: SplitRecordings, frames: int | 
     """Names of the errors of a motionless rollout of the longest trajectory; ConfigError if a metric fails on it."""
     split = recordings.split
     index = min(recordings.indices, key=lambda number: (-split.frames(number), split.particles(number)))
-    window = collate([recordings.at(index)], recordings.scene, frames)
+    window = collate([recordings.at(index)], recordings.reading, frames)
     count = window.target.shape[1]
     fields = {name: values.unsqueeze(1).expand(-1, count, -1) for name, values in window.initial.fields.items()}
     trial = copy.deepcopy(errors).cpu()

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nmpm.data.dataset import Dataset, load_trajectories
-from nmpm.data.loading.sources import FolderSource, HoldOut
+from nmpm.data.loading.sources import FolderSource
 from nmpm.data.motion import measure_motion
 from nmpm.emulator.similarity import Match, find_match
 from nmpm.errors import ConfigError
@@ -34,7 +34,7 @@ def match_data(
         data = load_trajectories(data)
     source = data.source if isinstance(data, Dataset) else data.data_source
     names = model.name, source.description
-    is_recorded = isinstance(source, FolderSource | HoldOut)  # simulated data state what is needed
+    is_recorded = isinstance(source, FolderSource)  # simulated data state what is needed
     motion = measure_motion(source.folder, source.metadata) if is_recorded else None
     return find_match(model.emulator, source.scene, motion, materials, step, strict, names)
 

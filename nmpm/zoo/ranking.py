@@ -26,7 +26,7 @@ from nmpm.evaluation.matched import MatchedPredictor
 from nmpm.evaluation.trade.scenes import moving_frames
 from nmpm.metrics import MSE
 from nmpm.particles import Window
-from nmpm.scene import Motion, Scene
+from nmpm.scene import Motion, Reading, Scene
 
 FRAMES = 32
 """Frames of the data that are predicted, or as many as there are."""
@@ -88,7 +88,7 @@ def _windows(recordings: Sequence[Recording], scene: Scene) -> Window:
     for number, recording in enumerate(recordings):
         last = moving_frames(recording, scene) + 2 - length
         starts.append(max(0, round(last * number / len(recordings))))
-    return PaddedRecordings.stack(recordings, scene).gather(range(len(recordings)), starts, length)
+    return PaddedRecordings.stack(recordings, Reading(scene)).gather(range(len(recordings)), starts, length)
 
 
 def _mean_squared_error(predicted: Tensor, window: Window) -> float:

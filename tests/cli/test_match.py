@@ -184,7 +184,7 @@ def test_on_data_of_its_own_a_model_changes_nothing_of_its_configuration(monkeyp
     (cli,) = built
     assert str(cli.matched) == ""
     assert cli.config["fit"]["model"]["cells"] == 32
-    assert cli.datamodule.reading is None
+    assert cli.datamodule.reading.is_plain
 
 
 def test_models_are_compared_on_data_of_another_kind(capsys, monkeypatch):

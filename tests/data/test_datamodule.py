@@ -165,7 +165,7 @@ def test_on_a_gpu_the_buffer_is_there_if_it_fits_or_else_batches_are_pinned_and_
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (free, 2 * free))
     monkeypatch.setattr(Window, "pin_memory", lambda window: pinned.append(window) or window)
     module = as_rank(module_of(make_dataset()), 0, 1, device)
-    source, plan = module.data_source.training_data(5, batch_size=2, buffer_size=2, passes=1, seed=0)
+    source, plan = module.data_source.training_data(5, module.reading, batch_size=2, buffer_size=2, passes=1, seed=0)
     assert module.buffer_device(source, plan).type == held_on
     if held_on == "cpu":
         windows = [*islice(module.train_dataloader(), 2), next(iter(module.val_dataloader()))]

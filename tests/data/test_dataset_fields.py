@@ -81,13 +81,13 @@ def test_fields_that_do_not_fit_are_named(folder):
         file["00002/stiffness"] = 1.0
     data = data_of(folder)
     with pytest.raises(DataError, match="stiffness has another shape in some trajectories"):
-        collate(list(data.data_source.recordings("train")), data.scene)
+        collate(list(data.data_source.recordings("train")), data.reading)
 
 
 def test_a_batch_pads_fields_without_touching_them(folder):
     data = data_of(folder)
     recordings = data.data_source.recordings("test")
-    window = collate(list(recordings), data.scene)
+    window = collate(list(recordings), data.reading)
     assert {name: tuple(values.shape) for name, values in window.fields.items()} == {
         "temperature": (3, 12, 8), "friction": (3, 1, 1), "stiffness": (3, 1, 8), "pressure": (3, 12, 8),
         "force": (3, 1, 1),

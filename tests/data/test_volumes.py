@@ -9,6 +9,7 @@ from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
+from nmpm.scene import Reading
 from tests.made_up import made_up_metadata, made_up_trajectory
 
 RADII = [np.array([0.8, 0.8, 0.9, 0.9, 0.9, 0.0]), np.array([0.8, 0.9, 0.8, 0.8, 0.8, 0.8, np.nan])]
@@ -22,20 +23,20 @@ def recordings_of(folder, name, values, split="train", dim=2) -> SplitRecordings
     ]
     write_split(folder / f"{split}.h5", stored)
     write_metadata(folder, made_up_metadata(dim))
-    return SplitRecordings(Split(folder / f"{split}.h5"), read_metadata(folder), infer_scene(folder))
+    return SplitRecordings(Split(folder / f"{split}.h5"), read_metadata(folder), Reading(infer_scene(folder)))
 
 
 @pytest.mark.parametrize(("name", "power"), [("radius", 2), ("diameter", 2), ("size", 2), ("volume", 1)])
 def test_sizes_become_volumes_over_their_mean(tmp_path, name, power):
     recordings = recordings_of(tmp_path, name, RADII)
-    window = collate([recordings[0], recordings[1]], recordings.scene, 4)
+    window = collate([recordings[0], recordings[1]], recordings.reading, 4)
     sizes = [torch.tensor(values[:-1]) ** power for values in RADII]
     mean = torch.cat(sizes).mean()
     torch.testing.assert_close(window.volume[0, :5].double(), sizes[0] / mean, rtol=1e-6, atol=0)
     torch.testing.assert_close(window.volume[1].double(), sizes[1] / mean, rtol=1e-6, atol=0)
     assert window.volume[0, 5] == 1  # padding
     assert torch.cat([window.volume[0, :5], window.volume[1]]).mean() == pytest.approx(1, rel=1e-6)
-    assert recordings.scene.fields == ()
+    assert recordings.reading.scene.fields == ()
     assert torch.equal(window.initial.volume, window.volume)
 
 

@@ -41,7 +41,7 @@ def test_without_a_valid_split_the_last_training_trajectory_validates(make_datas
     data = fit(folder).datamodule
     assert "train.h5, trajectory 00002, validates and is not trained on." in caplog.text
     assert [window.mask.shape[1] for window in data.val_dataloader()] == [7]
-    assert len(data.data_source.training_data(4, batch_size=1, buffer_size=1, passes=1, seed=0)[0]) == 2
+    assert len(data.data_source.training_data(4, data.reading, batch_size=1, buffer_size=1, passes=1, seed=0)[0]) == 2
     everything = fit(folder, limit_val_batches=0)
     assert len(everything.train_dataloader.buffer.plan.frames) == 3
 
@@ -52,7 +52,7 @@ def test_of_a_single_trajectory_the_last_fifth_validates(make_dataset, caplog):
     data = fit(folder).datamodule
     assert "train.h5, trajectory 00000, frames 16 to 19, validates and is not trained on." in caplog.text
     (window,) = data.val_dataloader()
-    (whole,) = data.data_source.source.recordings("train")
+    (whole,) = data_of(folder).recordings("train")
     assert torch.equal(window.frames[0], whole.frames[16:])
     assert torch.equal(window.fields["temperature"][0], whole.fields["temperature"][16:])
     (trained,) = data.data_source.recordings("train")

@@ -22,13 +22,14 @@ from nmpm.data.loading.presence import first_frames
 from nmpm.data.loading.recording import Recording
 from nmpm.data.loading.window_plan import Drawn, WindowPlan
 from nmpm.particles import Window
-from nmpm.scene import Scene
+from nmpm.scene import Reading, Scene
 
 
 class RecordingProvider(Protocol):
     """Recorded or simulated trajectories, as a buffer needs them."""
 
-    scene: Scene
+    @property
+    def reading(self) -> Reading: ...  # how they are read, and their scene
 
     @property
     def max_bytes(self) -> int: ...  # of the positions of the largest trajectory
@@ -89,7 +90,7 @@ class _BufferContents:
     def first_frames(self) -> dict[int, np.ndarray]:
         """For trajectories with absent particles, the frame at which a window that is drawn starts instead."""
         present = {trajectory: recording.present for trajectory, recording in self.recordings.items()}
-        every = 1 if self.padded.reading is None else self.padded.reading.every
+        every = self.padded.reading.every
         return {i: first_frames(mask.numpy(), self.length, every) for i, mask in present.items() if mask is not None}
 
     def start_inhabited(self, drawn: Drawn) -> Drawn:
@@ -175,8 +176,9 @@ class TrajectoryBuffer:
         missing = [index for index in members if index not in former]
         new = dict(zip(missing, self.provider.load(missing), strict=True))
         loaded = [former[index] if index in former else new[index] for index in members]
-        padded = PaddedRecordings.stack(loaded, self.provider.scene)
+        padded = PaddedRecordings.stack(loaded, self.provider.reading)
         # Views of the padded tensor, so that the memory of the loaded recordings is freed.
         recordings = {index: padded.recording(row, loaded[row]) for row, index in enumerate(members)}
-        motion = MotionSampler(recordings, self.provider.scene, self.plan.length) if self.plan.emphasis else None
+        scene = self.provider.reading.scene
+        motion = MotionSampler(recordings, scene, self.plan.length) if self.plan.emphasis else None
         return _BufferContents(padded.to(self.device), recordings, motion, self.plan.length)

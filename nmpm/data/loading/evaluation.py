@@ -61,5 +61,5 @@ class EvaluationLoader:
         return pin_for(self.device, map(self._read, self.batches))
 
     def _read(self, indices: Sequence[int]) -> Window:
-        read = collate([self.recordings.at(index) for index in indices or self._indices[:1]], self.recordings.scene)
+        read = collate([self.recordings.at(index) for index in indices or self._indices[:1]], self.recordings.reading)
         return read.scenes(slice(len(indices)))

@@ -22,9 +22,9 @@ _MOST_CHANGE = 0.5
 """Of a step by which the next may differ; of 0.25 to 1 the best for velocities of thinned grains, sand and water."""
 
 
-def check_horizon(horizon: int, reading: Reading | None) -> None:
+def check_horizon(horizon: int, reading: Reading) -> None:
     """Raise ConfigError if the data have none of the model's frames that a training step predicts."""
-    if reading is not None and reading.between > horizon:
+    if reading.between > horizon:
         raise ConfigError(
             f"The data have every {reading.between}th of the model's frames, none of the {horizon} that a training step"
             f" predicts: unroll at least {reading.between} frames (model.unroll, data.horizon)."

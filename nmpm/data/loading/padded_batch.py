@@ -30,10 +30,9 @@ class PaddedRecordings:
         frames: (S, T, N, D) positions, in domain length, in all frames of the data.
         material, mask, obstacle, obstacle_mask, gravity, fields, present, obstacle_frames, volume: as in `Window`, with
             S in place of B.
-        scene: The recordings' scene.
         tracks: (S, K, 3) the recordings' tracks, padded with such that are never there; None where all particles
             always are.
-        reading: The recordings' reading.
+        reading: The recordings' scene, and how windows are taken out of the frames.
     """
 
     frames: Tensor
@@ -42,18 +41,17 @@ class PaddedRecordings:
     obstacle: Tensor
     obstacle_mask: Tensor
     gravity: Tensor
-    scene: Scene
+    reading: Reading
     fields: Mapping[str, Tensor] = field(default_factory=dict)
     present: Tensor | None = None
     obstacle_frames: Tensor | None = None
     volume: Tensor | None = None
     tracks: np.ndarray | None = None
-    reading: Reading | None = None
 
     @classmethod
-    def stack(cls, recordings: Sequence[Recording], scene: Scene) -> PaddedRecordings:
+    def stack(cls, recordings: Sequence[Recording], reading: Reading) -> PaddedRecordings:
         """Copies recordings into padded tensors; raises a DataError if not all have the same kinds of fields."""
-        centre = [(low + high) / 2 for low, high in scene.domain]
+        centre = [(low + high) / 2 for low, high in reading.scene.domain]
         frames, mask = _pad_and_stack([recording.frames for recording in recordings], centre)
         obstacle, obstacle_mask = _pad_and_stack([recording.obstacle[None] for recording in recordings], centre)
         material, _ = _pad_and_stack([recording.material[None, :, None] for recording in recordings], [0])
@@ -65,12 +63,11 @@ class PaddedRecordings:
             obstacle=obstacle[:, 0],
             obstacle_mask=obstacle_mask,
             gravity=gravity,
-            scene=scene,
+            reading=reading,
             fields=_stack_fields(recordings),
             **_stack_presence(recordings),
             obstacle_frames=_stack_obstacle_frames(recordings, centre),
             volume=_stack_volumes(recordings),
-            reading=recordings[0].reading,
         )
 
     def recording(self, row: int, original: Recording) -> Recording:
@@ -89,7 +86,6 @@ class PaddedRecordings:
             tracks=original.tracks,
             obstacle_frames=original.obstacle_frames,
             volume=original.volume,
-            reading=original.reading,
         )
 
     def to(self, device: torch.device) -> PaddedRecordings:
@@ -104,25 +100,24 @@ class PaddedRecordings:
         are displacements. Windows are padded to a number of particles, without those that are there only before or
         only after the window; when it is left out, all particles of the largest recording are in the windows.
 
-        Rows, first frames and `length` are the data's; the windows' frames are the model's where the recordings have a
-        reading.
+        Rows, first frames and `length` are the data's; the windows' frames are the model's.
         """
         row = copy_to(torch.as_tensor(rows), self.frames.device)
         first = copy_to(torch.as_tensor(starts), self.frames.device)
-        between = 1 if self.reading is None else self.reading.between
+        every, between, scene = self.reading.every, self.reading.between, self.reading.scene
         frame = first[:, None] + torch.arange(0 if between == 1 else -1, length, device=self.frames.device)
-        frame = frame if between == 1 else frame.clamp(min=0)
+        frame = frame.clamp(min=0)
         if self.tracks is None:
             window = self._gather_columns(row, frame, slice(particles))
         else:
             tracks = _tracks_in_windows(self.tracks[rows], starts, length, particles)
             window = self._gather_tracks(row, frame, copy_to(torch.as_tensor(tracks), self.frames.device))
-        unwrap(window.frames, self.scene)
+        unwrap(window.frames, scene)
         if self.obstacle_frames is not None:
             window.obstacle_frames = self.obstacle_frames[row[:, None], frame]
-            unwrap(window.obstacle_frames, self.scene)
-        if self.reading is not None and self.reading.every > 1:
-            window = window.pick_frames(slice(None, None, self.reading.every))
+            unwrap(window.obstacle_frames, scene)
+        if every > 1:
+            window = window.pick_frames(slice(None, None, every))
         if between > 1:
             window = add_frames(window, between, first > 0)
         if window.obstacle_frames is not None:
@@ -169,17 +164,15 @@ class PaddedRecordings:
         )
 
 
-def collate(recordings: Sequence[Recording], scene: Scene, length: int | None = None) -> Window:
+def collate(recordings: Sequence[Recording], reading: Reading, length: int | None = None) -> Window:
     """Makes one batch of the first `length` frames of B recordings; of all frames, equally many, when None.
 
     Returns:
-        Window: padded to the largest recording. Where recordings have a reading, `length` counts frames of the model,
-            and the window goes on to the next frame that the data have.
+        Window: padded to the largest recording. `length` counts frames of the model; the window goes on to the next
+            frame that the data have.
     """
-    reading, frames = recordings[0].reading, len(recordings[0].frames)
-    if length is not None:
-        frames = length if reading is None else reading.data_frames(length)
-    return PaddedRecordings.stack(recordings, scene).gather(range(len(recordings)), [0] * len(recordings), frames)
+    frames = len(recordings[0].frames) if length is None else reading.data_frames(length)
+    return PaddedRecordings.stack(recordings, reading).gather(range(len(recordings)), [0] * len(recordings), frames)
 
 
 def pin_for(device: torch.device, batches: Iterator[Window]) -> Iterator[Window]:

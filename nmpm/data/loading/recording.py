@@ -3,8 +3,8 @@
 A recording holds what a model needs of a trajectory: the moving particles, their materials and fields, the obstacles,
 at rest or moving as recorded, and gravity in length per frame squared. Where a particle is absent, its position and its
 fields are those that it had last, or else will have first, so that all values are finite and no border of a period lies
-between them. Read for a model (`nmpm.scene.Reading`), materials are its own, and gravity is per frame of the model
-squared, but frames are still those of the data.
+between them. Materials, and the frames of which gravity is per frame squared, are those of a `nmpm.scene.Reading`; but
+`frames` are still the data's.
 """
 
 from __future__ import annotations
@@ -45,22 +45,19 @@ class Recording:
     tracks: np.ndarray | None = None  # (K, 3) where some are absent, see `find_tracks`: a column may hold several
     obstacle_frames: Tensor | None = None  # (T, M, D) float32; None where no obstacle of the scene moves
     volume: Tensor | None = None  # (N,) float32 volumes as multiples of the scene's `particle_volume`; None for 1
-    reading: Reading | None = None  # how windows are taken out of the frames; as they are when None
 
 
 @dataclass(frozen=True)
 class RecordingReader:
-    """Converts trajectories of a scene to recordings and validates them; the metadata name the type ids.
-
-    Args:
-        metadata: Of the dataset.
-        scene: The scene of the recordings, the reading's where there is one.
-        reading: How the data are read for a model.
-    """
+    """Converts trajectories to recordings and validates them; the metadata name the type ids."""
 
     metadata: Metadata
-    scene: Scene
-    reading: Reading | None = None
+    reading: Reading
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the recordings."""
+        return self.reading.scene
 
     def recording(
         self, trajectory: Trajectory, where: str, volume: np.ndarray | None = None, ids: np.ndarray | None = None
@@ -102,7 +99,6 @@ class RecordingReader:
             tracks=None if presence is None else find_tracks(presence.present, None if ids is None else ids[:, moving]),
             obstacle_frames=torch.from_numpy(obstacles) if self.scene.moving_obstacles else None,
             volume=None if volume is None else torch.from_numpy(check_positive(volume, moving, where)),
-            reading=self.reading,
         )
 
     def _check_rest(self, trajectory: Trajectory, where: str) -> None:
@@ -159,9 +155,8 @@ class RecordingReader:
 
     def _materials(self, types: np.ndarray, where: str) -> np.ndarray:
         index = np.zeros(types.shape, dtype=np.int64)
-        renamed = {} if self.reading is None else self.reading.materials
         for type_id in np.unique(types).tolist():
-            name = renamed.get(stated := self.metadata.particle_types[type_id], stated)
+            name = self.reading.materials.get(stated := self.metadata.particle_types[type_id], stated)
             if name not in self.scene.materials:
                 raise DataError(
                     f"{where}: the material {name!r} (type {type_id}) is not in the scene, which has"
@@ -177,28 +172,21 @@ class SplitRecordings(Sequence[Recording]):
     Args:
         split: The split.
         metadata: Of its dataset.
-        scene: The scene that the trajectories share; a reading's takes its place.
+        reading: How they are read, and the scene that they share.
         indices: Those of the trajectories in the split; all of them when None.
-        reading: How they are read for a model; as they are when None.
 
     Raises:
         DataError: if file and scene differ in the number of axes.
     """
 
     def __init__(
-        self,
-        split: Split,
-        metadata: Metadata,
-        scene: Scene,
-        indices: Sequence[int] | None = None,
-        reading: Reading | None = None,
+        self, split: Split, metadata: Metadata, reading: Reading, indices: Sequence[int] | None = None
     ) -> None:
-        scene = scene if reading is None else reading.scene
-        if split.dim != scene.dim:
-            raise DataError(f"{split.path}: positions have {split.dim} dimensions, the scene has {scene.dim}.")
-        self.split, self.scene = split, scene
+        if split.dim != reading.scene.dim:
+            raise DataError(f"{split.path}: positions have {split.dim} dimensions, the scene has {reading.scene.dim}.")
+        self.split, self.reading = split, reading
         self.indices = range(len(split)) if indices is None else indices
-        self.reader = RecordingReader(metadata, scene, reading)
+        self.reader = RecordingReader(metadata, reading)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -208,7 +196,7 @@ class SplitRecordings(Sequence[Recording]):
 
     def at(self, index: int) -> Recording:
         """The trajectory that has this index in the split."""
-        names = dict.fromkeys((*self.reader.metadata.fields, *self.scene.fields))
+        names = dict.fromkeys((*self.reader.metadata.fields, *self.reading.scene.fields))
         fields = read_fields(self.split, index, names) if names else {}
         trajectory = replace(self.split.read(index), fields=fields)
         ids = self.split.tracks(index) if np.isnan(trajectory.position[..., 0]).any() else None
@@ -233,9 +221,8 @@ class SplitRecordings(Sequence[Recording]):
         return tuple(map(self.split.frames, self.indices))
 
     def predicted_frames(self, index: int) -> int:
-        """Frames that a rollout of a trajectory of the split predicts, of the model where data are read for one."""
-        frames, reading = self.split.frames(index), self.reader.reading
-        return (frames if reading is None else reading.model_frames(frames)) - 2
+        """Frames of the model that a rollout of a trajectory of the split predicts."""
+        return self.reading.model_frames(self.split.frames(index)) - 2
 
     @property
     def max_bytes(self) -> int:
@@ -270,14 +257,13 @@ class SplitRecordings(Sequence[Recording]):
         """Those of the trajectories that have enough frames; a warning counts the others.
 
         Args:
-            least: Frames that a trajectory needs, of the model where the data are read for one.
+            least: Frames of the model that a trajectory needs.
             purpose: What needs them, in words.
 
         Raises:
             DataError: if no trajectory has as many.
         """
-        frames, reading = self.frames, self.reader.reading
-        least = least if reading is None else reading.data_frames(least)
+        frames, least = self.frames, self.reading.data_frames(least)
         if min(frames) >= least:
             return self
         if max(frames) < least:
@@ -295,7 +281,7 @@ class SplitRecordings(Sequence[Recording]):
 
     def subset(self, indices: Sequence[int]) -> SplitRecordings:
         """Those of the split's trajectories that have these indices."""
-        return SplitRecordings(self.split, self.reader.metadata, self.scene, indices, self.reader.reading)
+        return SplitRecordings(self.split, self.reader.metadata, self.reading, indices)
 
     def close(self) -> None:
         """Does nothing: a split keeps no file open and no thread running."""

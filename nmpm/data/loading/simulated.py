@@ -87,11 +87,9 @@ class SimulatedSource(EmbeddedSource):
         request = catalog.simulation_request(self.name, **options)
         return SimulatedRecordings(request.preset, request.seed, self.generate.get("workers"))
 
-    def training_data(
-        self, length: int, reading: Reading | None = None, **plan: Any
-    ) -> tuple[RecordingProvider, WindowPlan]:
-        length = length if reading is None else reading.data_frames(length)
-        self.training_recordings.read_for(reading)
+    def training_data(self, length: int, reading: Reading, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
+        length = reading.data_frames(length)
+        self.training_recordings.reading = reading
         frames = self.training_recordings.preset.frames + 1
         if frames < length:
             raise ConfigError(
@@ -111,23 +109,27 @@ class SimulatedRecordings:
     """
 
     def __init__(self, preset: Preset, seed: int = 0, workers: int | None = None) -> None:
-        self.preset, self.seed, self.scene = preset, seed, preset.scene
+        self.preset, self.seed = preset, seed
         self.workers = workers or usable_cores()
-        self.reader = RecordingReader(preset_metadata(preset), self.scene)
+        self.reader = RecordingReader(preset_metadata(preset), Reading(preset.scene))
         self._lock = Lock()
         self._requests: OrderedDict[tuple[int, ...], Task[list[Recording]]] = OrderedDict()
 
-    def read_for(self, reading: Reading | None) -> None:
-        """Reads the trajectories for a model from now on; as they are when None."""
-        if reading != self.reader.reading:
+    @property
+    def reading(self) -> Reading:
+        """How the trajectories are read."""
+        return self.reader.reading
+
+    @reading.setter
+    def reading(self, reading: Reading) -> None:
+        if reading != self.reading:
             self.close()
-            self.scene = self.preset.scene if reading is None else reading.scene
-            self.reader = RecordingReader(self.reader.metadata, self.scene, reading)
+            self.reader = RecordingReader(self.reader.metadata, reading)
 
     @property
     def max_bytes(self) -> int:
         """Size of the positions of the largest trajectory that can occur."""
-        return 4 * (self.preset.frames + 1) * self.preset.max_particles * self.scene.dim
+        return 4 * (self.preset.frames + 1) * self.preset.max_particles * self.preset.scene.dim
 
     def load(self, indices: Sequence[int]) -> list[Recording]:
         """Simulates several trajectories, see `simulate_all`; the results of the last two requests are cached."""

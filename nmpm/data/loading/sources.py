@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -25,8 +25,16 @@ SourceName = Literal["disk", "simulate", "hub"]
 _OPEN = "???"  # OmegaConf's for a value that is still to be given
 
 
+@dataclass(frozen=True)
 class DataSource(abc.ABC):
-    """A source of trajectories. Files are read and datasets simulated on first use."""
+    """A source of trajectories. Files are read and datasets simulated on first use.
+
+    Args:
+        holds_out: Whether there is no valid split: the last of the training trajectories validates and is not trained
+            on, or of a single one the end.
+    """
+
+    holds_out: bool = field(default=False, kw_only=True, repr=False)
 
     @property
     @abc.abstractmethod
@@ -49,28 +57,35 @@ class DataSource(abc.ABC):
         return read_metadata(self.folder)
 
     def recordings(self, name: str, reading: Reading | None = None) -> SplitRecordings:
-        """The trajectories of the split "train", "valid" or "test"; raises a DataError if its file is missing.
+        """The trajectories of the split "train", "valid" or "test", as they are unless a reading is given.
 
-        Read for a model where a reading is given.
+        Raises:
+            DataError: if its file is missing.
         """
-        return SplitRecordings(Split(find_split(self.folder, name)), self.metadata, self.scene, reading=reading)
+        held_out = self.holds_out and name == "valid"
+        path = find_split(self.folder, "train" if held_out else name)
+        recordings = SplitRecordings(Split(path), self.metadata, reading or Reading(self.scene))
+        if not self.holds_out or name == "test":
+            return recordings
+        if len(recordings) > 1:
+            return recordings.subset(recordings.indices[-1:] if held_out else recordings.indices[:-1])
+        end = recordings.split.frames(0) * 4 // 5
+        span = slice(end, None) if held_out else slice(end)
+        return SplitRecordings(Split(path, span), self.metadata, recordings.reading)
 
-    def training_data(
-        self, length: int, reading: Reading | None = None, **plan: Any
-    ) -> tuple[RecordingProvider, WindowPlan]:
+    def training_data(self, length: int, reading: Reading, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
         """The trajectories to train on, and which of their windows make up which batch.
 
         Args:
-            length: Frames of a window; shorter trajectories are left out, with a warning that counts them.
-            reading: How the data are read for a model, in whose frames `length` is; the plan counts the data's.
+            length: Frames of the model in a window; shorter trajectories are left out, with a warning that counts them.
+            reading: How the data are read.
             plan: The other fields of `WindowPlan`, except `frames`.
 
         Raises:
             DataError: if all trajectories are shorter.
         """
         recordings = self.recordings("train", reading).with_frames(length, "a training window")
-        length = length if reading is None else reading.data_frames(length)
-        return recordings, WindowPlan(frames=recordings.frames, length=length, **plan)
+        return recordings, WindowPlan(frames=recordings.frames, length=reading.data_frames(length), **plan)
 
 
 @dataclass(frozen=True)
@@ -107,58 +122,22 @@ class FolderSource(DataSource):
         return self.options if self.folder == self.path else Options()
 
 
-@dataclass(frozen=True)
-class HoldOut(DataSource):
-    """A source without a valid split: the last of its training trajectories validates, or of a single one the end.
-
-    Args:
-        source: Has a train split.
-    """
-
-    source: DataSource
-
-    @property
-    def description(self) -> str:
-        return self.source.description
-
-    @property
-    def folder(self) -> Path:
-        return self.source.folder
-
-    @property
-    def scene(self) -> Scene:
-        return self.source.scene
-
-    @cached_property
-    def metadata(self) -> Metadata:
-        return self.source.metadata
-
-    def recordings(self, name: str, reading: Reading | None = None) -> SplitRecordings:
-        if name not in ("train", "valid"):
-            return self.source.recordings(name, reading)
-        every, validates = self.source.recordings("train", reading), name == "valid"
-        if len(every) > 1:
-            return every.subset(every.indices[-1:] if validates else every.indices[:-1])
-        end = every.split.frames(0) * 4 // 5
-        span = slice(end, None) if validates else slice(end)
-        return SplitRecordings(Split(every.split.path, span), self.metadata, self.scene, reading=reading)
-
-
 def hold_out(source: DataSource) -> DataSource:
-    """A source without a valid split as `HoldOut`, which it says.
+    """A source without a valid split that validates on training trajectories, which it says.
 
     Raises:
         DataError: if its folder has that split under another name.
     """
     from lightning.pytorch.utilities import rank_zero_info  # imported late: only trainings need it
 
-    if isinstance(source, HoldOut):
+    if source.holds_out:
         return source
     if split_renames(source.folder, ("valid",)):
         find_split(source.folder, "valid")  # raises, and says how to rename it
-    held = HoldOut(source).recordings("valid")
+    source = replace(source, holds_out=True)
+    held = source.recordings("valid")
     rank_zero_info(f"No valid.h5: {held.split.where(held.indices[0])}, validates and is not trained on.")
-    return HoldOut(source)
+    return source
 
 
 @dataclass(frozen=True)

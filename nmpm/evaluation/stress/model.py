@@ -16,6 +16,7 @@ from nmpm.data.simulation import try_seeds
 from nmpm.emulator import Emulator
 from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.particles import Particles, Window
+from nmpm.scene import Reading
 from nmpm.sim import Preset
 
 _STREAM = 7
@@ -70,7 +71,7 @@ def simulate_window(model: ModelUnderTest, preset: Preset, count: int, frames: i
         UnstableError: if the simulator does not stay stable from several seeds in a row.
     """
     recordings = [recording for entropy in model.entropies(count) for recording in _record(preset, entropy, frames, ())]
-    return collate(recordings, preset.scene).to(model.device)
+    return collate(recordings, Reading(preset.scene)).to(model.device)
 
 
 def simulate_beside(
@@ -82,12 +83,12 @@ def simulate_beside(
     """
     for entropy in model.entropies(count):
         recordings = _record(preset, entropy, frames, others)
-        yield [collate([recording], preset.scene).to(model.device) for recording in recordings]
+        yield [collate([recording], Reading(preset.scene)).to(model.device) for recording in recordings]
 
 
 def _record(preset: Preset, entropy: tuple[int, ...], frames: int, others: Sequence[Preset]) -> list[Recording]:
     """One scene as the preset and others simulate it, from the first seed with which all stay stable."""
-    reader = RecordingReader(preset_metadata(preset), preset.scene)
+    reader = RecordingReader(preset_metadata(preset), Reading(preset.scene))
 
     def simulate(seed: int) -> list[Recording]:
         start = preset.draw(seed)

@@ -25,7 +25,7 @@ from nmpm.data.simulation import SimulationRequest
 from nmpm.data.split_files import find_split
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Window
-from nmpm.scene import Motion, Scene
+from nmpm.scene import Motion, Reading, Scene
 from nmpm.sim import Preset, load_preset, preset_from_dict
 
 MOVING = 0.02
@@ -65,7 +65,7 @@ class Scenes:
         """Some scenes as one batch, with so many frames to predict; with all of the shortest when left out."""
         recordings = [self.recordings[index] for index in indices]
         length = min(len(recording.frames) for recording in recordings) if frames is None else frames + 2
-        return collate(recordings, self.scene, length)
+        return collate(recordings, Reading(self.scene), length)
 
     def moving_frames(self, index: int) -> int:
         """Predicted frames until the scene comes to rest, see `MOVING`; at least 1."""
@@ -154,7 +154,7 @@ def read_scenes(name: str, folder: Path, count: int) -> Scenes:
     preset = None if plain is None else preset_from_dict(plain)
     scene = infer_scene(folder) if preset is None else preset.scene
     split = Split(find_split(folder, "test"))
-    recordings = SplitRecordings(split, metadata, scene).with_frames(3, "an evaluation")
+    recordings = SplitRecordings(split, metadata, Reading(scene)).with_frames(3, "an evaluation")
     indices = recordings.indices[:count]
     scenes = Scenes(name, scene, tuple(map(recordings.__getitem__, range(len(indices)))), preset, folder=folder)
     if preset is None:

@@ -19,6 +19,7 @@ from nmpm.data.simulation import SimulationRequest, same_test_scenes
 from nmpm.data.split_files import find_split
 from nmpm.errors import ConfigError, ZooError
 from nmpm.particles import Window
+from nmpm.scene import Reading
 from nmpm.sim import Preset, SimulatedTrajectory, load_preset, preset_from_dict, preset_names
 from nmpm.zoo.pretrained import Pretrained
 
@@ -55,7 +56,7 @@ def _read(model: Pretrained, frames: int | None, data: Path) -> Iterator[Window]
             f"{data} has other test scenes than the card of {model.name} is of: other scenes, seeds, revision of the"
             " simulator or number. Without a folder they are simulated."
         )
-    for window in EvaluationLoader(SplitRecordings(split, metadata, model.scene), 1):
+    for window in EvaluationLoader(SplitRecordings(split, metadata, Reading(model.scene)), 1):
         yield window if frames is None else window.first(frames + 2)
 
 
@@ -64,13 +65,15 @@ def _simulate(model: Pretrained, frames: int | None) -> Iterator[Window]:
     shorter = preset if frames is None else preset.with_frames(frames + 1)
     for index in range(request.counts["test"]):
         seed = request.trajectory_seed("test", index)
-        yield collate([as_recording(model, preset, shorter.simulate(seed), seed)], model.scene)
+        yield collate([as_recording(model, preset, shorter.simulate(seed), seed)], Reading(model.scene))
 
 
 def as_recording(model: Pretrained, preset: Preset, run: SimulatedTrajectory, seed: int) -> Recording:
     """A simulated trajectory as a recording of the model's scene."""
     stored = Trajectory(run.position, run.particle_type, run.attributes)
-    return RecordingReader(preset_metadata(preset), model.scene).recording(stored, f"{preset.name}, seed {seed}")
+    return RecordingReader(preset_metadata(preset), Reading(model.scene)).recording(
+        stored, f"{preset.name}, seed {seed}"
+    )
 
 
 def simulator_of(model: Pretrained) -> Preset | None:

@@ -15,7 +15,7 @@ from nmpm.data.loading.recording import Recording, SplitRecordings
 from nmpm.data.loading.window_plan import WindowPlan
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
-from nmpm.scene import Scene
+from nmpm.scene import Reading, Scene
 
 MIXED = tuple((12, size) for size in (3, 4, 40, 5, 6, 30))
 
@@ -26,7 +26,7 @@ def square(**facts) -> Scene:
 
 
 def buffer_of(folder, **options) -> TrajectoryBuffer:
-    recordings = SplitRecordings(Split(folder / "train.h5"), read_metadata(folder), infer_scene(folder))
+    recordings = SplitRecordings(Split(folder / "train.h5"), read_metadata(folder), Reading(infer_scene(folder)))
     known = {"length": 5, "batch_size": 4, "buffer_size": 2, "passes": 1.0, "seed": 0}
     frames = tuple(map(recordings.split.frames, range(len(recordings))))
     return TrajectoryBuffer(recordings, WindowPlan(frames=frames, **(known | options)))

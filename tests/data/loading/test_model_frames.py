@@ -49,13 +49,13 @@ def reading_of(folder: Path, **changes) -> Reading:
     return dataclasses.replace(reading, scene=dataclasses.replace(reading.scene, materials=("clay",), dt=dt))
 
 
-def data_of(folder: Path, reading: Reading | None, **options) -> TrajectoryDataModule:
+def data_of(folder: Path, reading: Reading, **options) -> TrajectoryDataModule:
     data = TrajectoryDataModule(str(folder), **({"horizon": 8, "batch_size": 4, "buffer_size": 2} | options))
     data.reading = reading
     return data
 
 
-def whole(folder: Path, reading: Reading | None) -> Window:
+def whole(folder: Path, reading: Reading) -> Window:
     return next(iter(data_of(folder, reading).test_dataloader()))
 
 
@@ -67,7 +67,7 @@ def test_materials_get_the_models_names_and_others_are_refused(tmp_path):
     folder = written(tmp_path, [made_up_trajectory(9, 4)])
     reading = reading_of(folder)
     assert data_of(folder, reading).scene.materials == ("clay",)
-    plain, read = whole(folder, None), whole(folder, reading)
+    plain, read = whole(folder, Reading(FolderSource(folder).scene)), whole(folder, reading)
     assert all(torch.equal(value, vars(read)[name]) for name, value in vars(plain).items() if torch.is_tensor(value))
     assert read.observed is None
     wrong = dataclasses.replace(reading, materials={})
@@ -178,8 +178,6 @@ def test_too_short_horizons_and_trajectories_are_refused(tmp_path):
 def test_only_the_models_frames_are_needed(tmp_path):
     folder = written(tmp_path, [fall(9), fall(9, seed=1)])
     reading = reading_of(folder, between=4)
-    recordings = SplitRecordings(
-        Split(folder / "test.h5"), FolderSource(folder).metadata, reading.scene, reading=reading
-    )
-    window = collate([recordings[0]], reading.scene, 3)
+    recordings = SplitRecordings(Split(folder / "test.h5"), FolderSource(folder).metadata, reading)
+    window = collate([recordings[0]], reading, 3)
     assert window.observed.tolist() == [[False, True, False, False, False, True]]

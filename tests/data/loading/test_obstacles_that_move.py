@@ -11,6 +11,7 @@ from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
+from nmpm.scene import Reading
 from tests.made_up import made_up_metadata, made_up_trajectory
 
 PADDLE = 2
@@ -36,14 +37,14 @@ def folder(tmp_path):
 
 def recordings_of(folder, **options) -> SplitRecordings:
     source = FolderSource(folder, Options(**options))
-    return SplitRecordings(Split(folder / "train.h5"), source.metadata, source.scene)
+    return SplitRecordings(Split(folder / "train.h5"), source.metadata, Reading(source.scene))
 
 
 def test_their_positions_in_each_frame_are_part_of_a_window(folder):
     recordings = recordings_of(folder, prescribed=frozenset({PADDLE}))
-    scene = recordings.scene
+    scene = recordings.reading.scene
     assert (scene.materials, scene.obstacles, scene.moving_obstacles) == (("goop",), True, True)
-    window = collate([recordings[0], recordings[1]], scene, 8)
+    window = collate([recordings[0], recordings[1]], recordings.reading, 8)
     assert window.obstacle_mask.sum(dim=1).tolist() == [3, 4]
     assert torch.equal(window.obstacle, window.obstacle_frames[:, 1])
     steps = window.obstacle_frames.diff(dim=1)  # by minimum image across the periodic border
@@ -96,7 +97,7 @@ def test_the_recorded_blade_of_an_excavation(recorded, tmp_path):
     source = FolderSource(tmp_path / "out")
     (name,) = (path.stem for path in (tmp_path / "out").glob("*.h5"))
     recordings = source.recordings(name)
-    assert recordings.scene.moving_obstacles
+    assert recordings.reading.scene.moving_obstacles
     recording = recordings[0]
     speed = torch.linalg.norm(recording.obstacle_frames.diff(dim=0), dim=-1).mean(dim=-1)
     assert recording.obstacle_frames.shape == (11, 2543, 3)

@@ -16,6 +16,7 @@ from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.window_plan import WindowPlan
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
+from nmpm.scene import Reading
 from tests.made_up import made_up_metadata, made_up_trajectory
 
 FRAMES = (16, 20, 13, 18)
@@ -45,7 +46,7 @@ def folder(tmp_path):
 
 
 def recordings_of(folder) -> SplitRecordings:
-    return SplitRecordings(Split(folder / "train.h5"), read_metadata(folder), infer_scene(folder))
+    return SplitRecordings(Split(folder / "train.h5"), read_metadata(folder), Reading(infer_scene(folder)))
 
 
 def buffer_of(folder, **options) -> TrajectoryBuffer:
@@ -128,8 +129,8 @@ def test_resumes_at_any_batch_with_all_ranks_alike(folder, options):
 
 def test_a_complete_trajectory_is_the_same_beside_others(folder):
     recordings = recordings_of(folder)
-    alone = collate([recordings[3]], recordings.scene, 9)
-    beside = collate([recordings[0], recordings[3]], recordings.scene, 9)
+    alone = collate([recordings[3]], recordings.reading, 9)
+    beside = collate([recordings[0], recordings[3]], recordings.reading, 9)
     count = alone.mask.shape[1]
     assert alone.present is None
     assert torch.equal(beside.frames[1, :, :count], alone.frames[0])
@@ -178,7 +179,7 @@ def test_particles_that_share_a_column_are_apart_in_windows(tmp_path):
         write_split(tmp_path / "train.h5", [stored])
         recordings = recordings_of(tmp_path)
         plan = WindowPlan(frames=(20,), length=5, batch_size=8, buffer_size=1, passes=4.0, seed=0)
-        windows += [next(TrajectoryBuffer(recordings, plan).batches()), collate([recordings[0]], recordings.scene)]
+        windows += [next(TrajectoryBuffer(recordings, plan).batches()), collate([recordings[0]], recordings.reading)]
     for one, other in ((windows[0], windows[2]), (windows[1], windows[3])):
         assert torch.equal(one.frames, other.frames)
         assert torch.equal(one.present, other.present)

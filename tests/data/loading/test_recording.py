@@ -11,12 +11,12 @@ from nmpm.data.loading.padded_batch import unwrap
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
-from nmpm.scene import Scene
+from nmpm.scene import Reading, Scene
 
 
 def recordings_of(folder, **arguments) -> SplitRecordings:
     scene = infer_scene(folder, Options(**arguments))
-    return SplitRecordings(Split(folder / "train.h5"), read_metadata(folder), scene)
+    return SplitRecordings(Split(folder / "train.h5"), read_metadata(folder), Reading(scene))
 
 
 def test_static_particles_are_separated(make_dataset):

@@ -9,6 +9,7 @@ from nmpm.data.format import Trajectory
 from nmpm.data.generate import preset_metadata
 from nmpm.data.loading.recording import RecordingReader
 from nmpm.errors import ConfigError, DataError
+from nmpm.scene import Reading
 from nmpm.sim import InitialState, load_preset, preset_from_dict
 from nmpm.sim.predictability import twin_of
 from nmpm.sim.preset import BOUNDARY
@@ -78,7 +79,7 @@ def test_trajectories_are_read_with_their_own_volume():
     start = next(start for start in STARTS if start.time != 1.0)
     made = UNIVERSAL.simulate_from(start, 4)
     assert np.ptp(made.position[:, made.particle_type == BOUNDARY], axis=0).max() == 0
-    reader = RecordingReader(preset_metadata(UNIVERSAL), UNIVERSAL.scene)
+    reader = RecordingReader(preset_metadata(UNIVERSAL), Reading(UNIVERSAL.scene))
     recording = reader.recording(Trajectory(made.position, made.particle_type, made.attributes), "here")
     np.testing.assert_allclose(recording.volume, (start.variant.spacing / UNIVERSAL.spacing) ** 2, rtol=1e-6)
     np.testing.assert_allclose(recording.gravity, np.array(start.gravity) * UNIVERSAL.frame_dt**2, rtol=1e-6)
