@@ -166,7 +166,9 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--prescribed", metavar="ID,...", help="obstacles that move as recorded, like a paddle, e.g. 2")
     group.add_argument("--bounds", metavar="LOW:HIGH,...", help="where particles may be, per axis, e.g. 0:1,0:0.5")
     group.add_argument("--dt", type=float, help="time between stored frames, in the data's unit")
-    group.add_argument("--gravity", metavar="X,Y[,Z]", help="acceleration in length/time², e.g. 0,-9.81")
+    group.add_argument(
+        "--gravity", metavar="X,Y[,Z]", help="acceleration in length/time², e.g. 0,-9.81, or --gravity=-9.81,0"
+    )
     group.add_argument(
         "--boundary", metavar="KIND,...", help='"wall", "periodic" or "open" per axis, e.g. periodic,wall'
     )

@@ -10,18 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from nmpm.cli.match_options import MatchOptions, describe
-from nmpm.data.convert import Options, native_file
-from nmpm.data.convert.native import file_metadata
+from nmpm.cli.options import data_options
+from nmpm.data.convert import native_file
+from nmpm.data.convert.native import file_metadata, with_family
 from nmpm.data.dataset import Dataset
 from nmpm.data.facts import FOUND
 from nmpm.data.format import METADATA_FILE, Metadata, Split
-from nmpm.data.gravity import trajectory_gravity
+from nmpm.data.gravity import check_gravity, trajectory_gravity
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.sources import FolderSource
-from nmpm.data.metadata import FAMILIES
 from nmpm.emulator.fields import warn_of_ignored
-from nmpm.errors import ConfigError, NmpmError
+from nmpm.errors import ConfigError
 from nmpm.particles import Window
 from nmpm.scene import Reading, Scene
 from nmpm.zoo import Pretrained
@@ -50,19 +50,25 @@ class RecordedStart:
 
     @classmethod
     def of(cls, model: Pretrained, options: argparse.Namespace) -> RecordedStart:
-        """The trajectory of the options --data, --split and --trajectory; what matches it to the model is printed.
+        """The trajectory of the options --data, --split and --trajectory, with the facts that others state.
+
+        What matches it to the model is printed.
 
         Raises:
             ConfigError: if there is no such trajectory, or the model cannot be matched to the data.
         """
-        path, index = options.data, options.trajectory
-        split = Split(native_file(path, options.split))
-        family = _family(split, model.scene)
-        metadata = file_metadata(split, family)
+        path, index, facts = options.data, options.trajectory, data_options(options)
+        split = Split(native_file(path, options.split, facts))
         if index >= len(split):
             raise ConfigError(f"--trajectory {index}: {path} contains trajectories 0 … {len(split) - 1}.")
         if split.frames(index) < 2:
             raise ConfigError(f"--trajectory {index}: it has one frame in {path}; a rollout starts from two.")
+        facts = with_family(facts, split)
+        metadata = file_metadata(split, facts)
+        if facts.gravity is not None:
+            check_gravity(facts.gravity, trajectory_gravity(split.attributes(index), metadata, ""), path)
+        if split.path in (path, path / split.path.name):  # a converted copy has the facts
+            metadata = facts.apply_to(metadata)
         stated = MatchOptions.read(options.materials, options.stride, options.strict)
         if stated.stride is None and is_of_kind(model.scene, metadata, split, index):
             warn_of_ignored(model.scene, metadata.fields)
@@ -70,7 +76,7 @@ class RecordedStart:
             window = collate([SplitRecordings(split, metadata, plain)[index]], plain)
             return cls(model, window, window, model.scene)
         beside = path == split.path and (path.parent / METADATA_FILE).is_file()
-        data = Dataset(FolderSource(path.parent if beside else path, Options(family)))
+        data = Dataset(FolderSource(path.parent if beside else path, facts))
         match = match_data(model, data, *stated)
         sys.stdout.write(describe(match, model.name))
         scene = dataclasses.replace(data.scene, dt=data.scene.dt * match.reading.every)
@@ -81,23 +87,18 @@ class RecordedStart:
         return cls(model.matched(match), window, written, scene, match.reading.between)
 
 
-def _family(split: Split, scene: Scene) -> str | None:
-    """DeepMind's meaning of type ids, where the file does not state one and the model has materials of theirs."""
-    try:
-        file_metadata(split, None)
-    except NmpmError:
-        return "deepmind" if set(scene.materials) <= set(FAMILIES["deepmind"].types.values()) else None
-    return None
-
-
 def is_of_kind(scene: Scene, metadata: Metadata, split: Split, index: int) -> bool:
     """Whether a trajectory is of the kind of a model's scene: in its materials, units, frames, box and gravity.
+
+    Obstacles that move are of the kind of a scene that has such.
 
     What could only be guessed, of a file that states nothing, decides nothing where the box may be the model's.
     """
     types = set(np.unique(split.particle_type(index)).tolist())
     names = {metadata.particle_types[i] for i in metadata.moving_types if i in types}
     if metadata.dim != scene.dim or not names <= set(scene.materials) or metadata.boundary != scene.boundary:
+        return False
+    if metadata.prescribed_types & types and not scene.moving_obstacles:
         return False
     guessed = {name for name, how in metadata.extra.get(FOUND, {}).items() if str(how).startswith("guessed")}
     ours, theirs = np.array(scene.bounds if "bounds" not in guessed else scene.domain), np.array(metadata.bounds)

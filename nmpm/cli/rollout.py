@@ -20,7 +20,9 @@ from nmpm.cli.options import (
     check_device,
     check_exists,
     choose_threads,
+    data_options,
     gravity_option,
+    stated_facts,
 )
 from nmpm.data.write import find_writer, write_trajectory
 from nmpm.errors import ConfigError
@@ -41,6 +43,9 @@ examples:
   nmpm rollout runs/grains --data grains.npz             or from any other form of data
   nmpm rollout sandramps --data grains --materials big=sand,small=sand
                                                          or from data of another kind
+  nmpm rollout runs/mixer --data mixer.npz --types 0=dough,1=blade --prescribed 1
+                                                         with facts that the files lack
+  nmpm rollout wbcsph --gravity 6,7.5                    thrown blocks, where a model takes any gravity
   nmpm rollout runs/goop/checkpoints/last.ckpt
   nmpm rollout goop --out splash.usda                    for Blender; .vtkhdf for ParaView, .csv, …
   nmpm rollout goop --device cuda --runtime auto         on a GPU, by CUDA graphs
@@ -114,12 +119,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--particles", type=int, default=1000, help="approximate number to throw (default: 1000)")
     parser.add_argument("--blocks", type=int, help="number of blocks (default: one of each material)")
     parser.add_argument(
-        "--gravity",
-        metavar="X,Y[,Z]",
-        help="that pulls at thrown blocks, in length/s², for models of scenes that differ in it, e.g. 0,9.81, or"
-        " --gravity=-9.81,0 (default: downwards)",
-    )
-    parser.add_argument(
         "--precision",
         choices=["float32", "bfloat16"],
         default="float32",
@@ -140,12 +139,13 @@ def _check(options: argparse.Namespace) -> None:
     for name, least in (("frames", 1), ("threads", 1), ("particles", 1), ("blocks", 1), ("seed", 0), ("trajectory", 0)):
         check_at_least(f"--{name}", getattr(options, name), least)
     match = MatchOptions.read(options.materials, options.stride, options.strict)
-    if options.data is None and match != MatchOptions():
-        raise ConfigError("--materials, --stride and --strict are about recorded data: give --data too.")
+    data_options(options)
     if options.data is not None:
         check_exists("--data", options.data)
-        if options.gravity is not None:
-            raise ConfigError("--gravity is of thrown blocks: leave it out beside --data, which has its own.")
+    elif match != MatchOptions():
+        raise ConfigError("--materials, --stride and --strict are about recorded data: give --data too.")
+    elif facts := [fact for fact in stated_facts(options) if not fact.startswith("--gravity")]:
+        raise ConfigError(f"{facts[0]} is about recorded data: give --data too.")
     find_writer("--out", options.out)
     check_device(options.device)
 

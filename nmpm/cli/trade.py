@@ -17,6 +17,8 @@ from nmpm.cli.options import (
     check_device,
     check_folder,
     check_input,
+    data_options,
+    stated_facts,
 )
 from nmpm.errors import ConfigError
 
@@ -88,9 +90,11 @@ def add_scene_options(parser: argparse.ArgumentParser, command: str, scenes: int
 
 def measure_and_report(command: str, options: argparse.Namespace, dataset: str) -> None:
     """Measure the sweep of a command on a dataset, print the table, and write the report."""
-    match = MatchOptions.read(options.materials, options.stride, options.strict)
+    match, facts = MatchOptions.read(options.materials, options.stride, options.strict), data_options(options)
     check_at_least("--scenes", options.scenes, 1)
     check_at_least("--wider", options.wider, 2)
+    if options.wider and (stated := stated_facts(options)):
+        raise ConfigError(f"{stated[0]}: --wider simulates scenes, and their facts are known: leave it out.")
     check_device(options.device)
     wider = f"-{options.wider}-times-as-wide" if options.wider else ""
     out = options.out or Path(command) / f"{Path(dataset).name}{wider}"
@@ -112,7 +116,7 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
     if options.wider:
         scenes = trade.find_wider_scenes(dataset, sweep.scenes, options.wider)
     else:
-        scenes = trade.find_scenes(dataset, sweep.scenes)
+        scenes = trade.find_scenes(dataset, sweep.scenes, facts)
     _check_materials(match, models)
     device = find_device(options.device)
     choices = trade.make_choices(sweep, scenes, models, device, predictors, **match._asdict())

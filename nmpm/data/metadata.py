@@ -61,6 +61,17 @@ def find_family(name: str) -> Family:
     return FAMILIES[name]
 
 
+def unambiguous_family(particle_type: np.ndarray) -> str | None:
+    """The family that type ids are of; None where several give them different meanings, or none any.
+
+    DeepMind's have materials that the others lack; fluids and walls without further types mean the same in the others.
+    """
+    ids = set(np.unique(particle_type).tolist())
+    if ids <= set(FAMILIES["deepmind"].types) and ids & {5, 6, 7}:
+        return "deepmind"
+    return "lagrangebench" if ids <= {-1, 0, 1, 2} else None
+
+
 @dataclass(frozen=True)
 class Metadata:
     """Facts that all trajectories of a dataset share; lengths in domain length, times in seconds."""
@@ -122,10 +133,10 @@ class Metadata:
         if unknown := self.unknown_types(particle_type):
             named = ", ".join(f"{i} {name}" for i, name in sorted(self.particle_types.items()))
             raise DataError(
-                f"{where}: unknown particle type {', '.join(map(str, unknown))} (known: {named}). Name it in"
-                f' {METADATA_FILE}, e.g. "particle_types": {{"{unknown[0]}": "sand"}}, or at conversion'
-                f" (--types {unknown[0]}=sand), or choose another family"
-                f" ({', '.join(sorted(FAMILIES))})."
+                f"{where}: unknown particle type {', '.join(map(str, unknown))} (known: {named}). Name it: --types"
+                f" {unknown[0]}=sand (to fit, in a copy: nmpm convert DATA NEW --types {unknown[0]}=sand), or in"
+                f' {METADATA_FILE}, "particle_types": {{"{unknown[0]}": "sand"}}; or state another family:'
+                f" --family {' or '.join(sorted(FAMILIES))}."
             )
 
 

@@ -28,23 +28,25 @@ _BYTES = 2**24
 _LENGTH_KEYS = ("sequence_length", "sequence_length_train", "sequence_length_test")
 
 
-def read_metadata(folder: Path, family: str | None = None) -> Metadata:
+def read_metadata(folder: Path, family: str | None = None, types: Mapping[int, str] | None = None) -> Metadata:
     """Reads and checks a dataset's `metadata.json`.
 
-    A family gives the type ids their meaning where the file does not; a file that contradicts it wins, with a warning.
+    A family, or else names of types, give the type ids their meaning where the file does not; a file that contradicts
+    the family wins, with a warning.
 
     Raises:
         DataError: if the file is missing or not JSON, or a key is missing or has a wrong value.
         ConfigError: if there is no such family.
     """
     path = Path(folder) / METADATA_FILE
-    return parse_metadata(load_json(path), path, family)
+    return parse_metadata(load_json(path), path, family, types)
 
 
 def parse_metadata(
     plain: Mapping[str, Any],
     where: Path,
     family: str | None = None,
+    types: Mapping[int, str] | None = None,
     problems: list[str] | None = None,
     substitutes: Mapping[str, Any] | None = None,
 ) -> Metadata:
@@ -55,7 +57,7 @@ def parse_metadata(
     check_plain(plain, where)
     keys = JsonKeys(where, plain, problems, substitutes)
     dim = keys.take("dim", parse_dim)
-    types, static, prescribed = _types(keys, family)
+    names, static, prescribed = _types(keys, family, types)
     length_key = next((key for key in _LENGTH_KEYS if key in keys.left), _LENGTH_KEYS[0])
     length = keys.peek(length_key, parse_count)
     keys.left.pop("sequence_length", None)
@@ -66,7 +68,7 @@ def parse_metadata(
         dt=keys.take("dt", parse_positive) * keys.peek("write_every", parse_positive, 1.0),
         dim=dim,
         sequence_length=length,
-        particle_types=types,
+        particle_types=names,
         static_types=static,
         prescribed_types=keys.take("prescribed_types", parse_ids, prescribed),
         boundary=keys.take("boundary", lambda value: parse_boundary(value, dim), kinds),
@@ -79,15 +81,19 @@ def parse_metadata(
     )
 
 
-def _types(keys: JsonKeys, family: str | None) -> tuple[dict[int, str], frozenset[int], frozenset[int]]:
+def _types(
+    keys: JsonKeys, family: str | None, stated: Mapping[int, str] | None
+) -> tuple[dict[int, str], frozenset[int], frozenset[int]]:
     """Names of type ids and static ids, from the file or else the family, and the family's prescribed ids."""
     fallback = find_family(family) if family is not None else None
-    if fallback is None and keys.left.get("particle_types") is None and keys.problems is None:
+    default = fallback.types if fallback else stated
+    if default is None and keys.left.get("particle_types") is None and keys.problems is None:
         raise DataError(
             f"{keys.where}: the key 'particle_types' is missing, so the type ids have no meaning. Add it, e.g."
-            f' "particle_types": {{"7": "goop"}}, or give the family: {", ".join(sorted(FAMILIES))}.'
+            f' "particle_types": {{"7": "goop"}}, or state the names, --types 7=goop, or the family that has them,'
+            f" --family {' or '.join(sorted(FAMILIES))} (fit: --data.family)."
         )
-    types: dict[int, str] = keys.take("particle_types", parse_names, dict(fallback.types) if fallback else REQUIRED)
+    types: dict[int, str] = keys.take("particle_types", parse_names, REQUIRED if default is None else dict(default))
     names = fallback.types if fallback else types
     different = [f"{i} = {name}, not {names[i]}" for i, name in types.items() if names.get(i, name) != name]
     if different:

@@ -39,7 +39,7 @@ def infer_scene(folder: Path, options: Options | None = None) -> Scene:
         ConfigError: if an option does not match the number of axes, is invalid, or contradicts the files' gravity.
     """
     folder, options = Path(folder), options or Options()
-    stated = read_metadata(folder, options.family)
+    stated = read_metadata(folder, options.family, options.types)
     metadata = options.apply_to(stated)
     if options.gravity is not None:
         check_gravity(options.gravity, stated.gravity, folder / METADATA_FILE)

@@ -206,6 +206,44 @@ def test_models_are_compared_on_data_of_another_kind(capsys, monkeypatch):
     assert "free fall" in said
 
 
+FACTS = ("--types", "7=steel,3=spoon", "--prescribed", "3", "--bounds", "350:1150,350:1150")
+"""Of `write_stirred`."""
+
+
+def write_stirred() -> Path:
+    """As `write_foreign`, of one trajectory whose obstacles move, in a file that names no types and no box."""
+    run = Split(write_foreign() / "test.h5").read(0)
+    run.position[:, run.particle_type == 3] += np.linspace(0, 20, len(run.position), dtype=np.float32)[:, None, None]
+    facts = {"dt": 2.5, "gravity": (0.0, -9.81e-3)}
+    np.savez("stirred.npz", position=run.position, types=run.particle_type, **facts)
+    return Path("stirred.npz")
+
+
+def test_a_rollout_takes_facts_that_files_lack(capsys):
+    data = write_stirred()
+    assert main(["rollout", "goop", "--data", str(data), *FACTS]) == 0
+    assert "steel -> goop (the only material of goop); obstacles -> solid channel" in capsys.readouterr().out
+    written = Split(Path("out.h5")).read(0)
+    moved = np.ptp(written.position[:, 9:], axis=0)
+    np.testing.assert_allclose(moved, 20, rtol=0.05)
+    assert main(["rollout", "goop", "--types", "7=steel"]) == 1
+    assert "--types=7=steel is about recorded data: give --data too" in capsys.readouterr().err
+
+
+def test_models_are_compared_on_data_with_facts_that_files_lack(capsys, monkeypatch):
+    sweep = "{scenes: 1, timing: {rounds: 1, frames: 4}, models: {precision: [float32], batch: [1]}}"
+    monkeypatch.setattr("nmpm.evaluation.trade.shipped_sweep_text", lambda _: sweep)
+    write_stirred()
+    for split in ("train", "test"):
+        Path("stirred", split).mkdir(parents=True)
+        shutil.copy("stirred.npz", Path("stirred", split))
+    words = ["compare", "goop", "--data", "stirred", "--out", "out"]
+    assert main([*words, *FACTS]) == 0
+    assert "what differs from those of its training: bounds" in " ".join(capsys.readouterr().out.split())
+    assert main(["compare", "goop", "--data", "goop", "--gravity=0,-1"]) == 1
+    assert "--gravity: the scenes of goop are simulated" in capsys.readouterr().err
+
+
 def test_models_of_a_zoo_are_ranked_by_what_they_predict_of_data(capsys):
     for name in ("goop", "multimaterial", "waterdrop3d"):
         shutil.copytree(shipped_folder("zoo") / name, Path("zoo", name))

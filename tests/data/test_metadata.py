@@ -1,12 +1,14 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.data.format import METADATA_FILE, Metadata, read_metadata, write_metadata
 from nmpm.data.generate import preset_metadata
+from nmpm.data.metadata import unambiguous_family
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim import load_preset
 
@@ -59,12 +61,20 @@ def test_what_is_written_is_read_again(tmp_path_factory, dim, low, dt, types, ki
 def test_a_family_where_the_file_does_not_name_types(write_keys):
     assert read_metadata(write_keys(), "lagrangebench").particle_types == {3: "boundary", 7: "goop"}
     folder = write_keys(particle_types=None)
-    with pytest.raises(DataError, match=r"particle_types.*deepmind, jax-sph, lagrangebench"):
+    with pytest.raises(DataError, match=r"particle_types.*--family deepmind or jax-sph or lagrangebench"):
         read_metadata(folder)
+    assert read_metadata(folder, types={7: "steel", 3: "wall"}).static_types == {3}
     assert read_metadata(folder, "deepmind").particle_types[7] == "goop"
     assert read_metadata(folder, "lagrangebench").static_types == {1}
     with pytest.raises(ConfigError, match=r"'dmcf'.*deepmind, jax-sph, lagrangebench"):
         read_metadata(folder, "dmcf")
+
+
+@pytest.mark.parametrize(
+    ("ids", "family"), [([5], "deepmind"), ([0, 7], "deepmind"), ([0], "lagrangebench"), ([0, 1, 3], None), ([9], None)]
+)
+def test_a_family_is_told_by_type_ids_that_only_one_has(ids, family):
+    assert unambiguous_family(np.array(ids)) == family
 
 
 def test_lagrangebench_metadata(write_keys):

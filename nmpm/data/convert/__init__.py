@@ -171,11 +171,13 @@ def native_file(path: Path, split: str | None = None, options: Options | None = 
         DataError: if the data cannot be read.
         ConfigError: if they have no such split.
     """
+    as_stored = options is None or not options.changes_positions
     if _is_native_file(path):
         if split is not None:
             raise ConfigError(f"--split {split}: {path} is the file of a split; leave it out, or name the folder.")
-        return path
-    paths = split_paths(path if is_native(path) else native_folder(path, options))
+        if as_stored:
+            return path
+    paths = split_paths(path if is_native(path) and as_stored else native_folder(path, options))
     if split is not None and split not in paths:
         raise ConfigError(f"--split {split}: {path} has {', '.join(paths)}.")
     return paths[split] if split is not None else paths.get("test", next(iter(paths.values())))

@@ -14,8 +14,9 @@ from typing import ClassVar
 from nmpm.data.convert.base import DatasetFormat, ForeignDataset, Options, split_files
 from nmpm.data.described import DESCRIPTION, described_metadata
 from nmpm.data.format import METADATA_FILE, Metadata, Split, Trajectory, read_metadata
+from nmpm.data.metadata import unambiguous_family
 from nmpm.data.split_files import split_paths
-from nmpm.errors import DataError
+from nmpm.errors import DataError, NmpmError
 
 _PATTERNS = ("*.h5", "*.vtkhdf")
 
@@ -30,8 +31,9 @@ class Native(DatasetFormat):
         return (path / METADATA_FILE).is_file() and bool(split_paths(path))
 
     def open(self, path: Path, options: Options) -> ForeignDataset:
-        metadata = options.apply_to(read_metadata(path, options.family))
         splits = {name: Split(file) for name, file in split_paths(path).items()}
+        options = with_family(options, next(iter(splits.values())))
+        metadata = options.apply_to(read_metadata(path, options.family, options.types))
         note = (
             f"Particle types have the meaning of the {options.family} family where {METADATA_FILE} does not name them."
         )
@@ -51,25 +53,37 @@ class NativeFiles(DatasetFormat):
 
     def recognises(self, path: Path) -> bool:
         files = split_files(path, *_PATTERNS)
-        return bool(files) and bool(file_metadata(Split(next(iter(files.values()))[0]), None))
+        return bool(files) and bool(file_metadata(Split(next(iter(files.values()))[0]), Options()))
 
     def open(self, path: Path, options: Options) -> ForeignDataset:
         splits = {name: [Split(file) for file in files] for name, files in split_files(path, *_PATTERNS).items()}
         if not splits:
             raise DataError(f"{path}: no file {' or '.join(_PATTERNS)} there.")
         return ForeignDataset(
-            metadata=options.apply_to(file_metadata(next(iter(splits.values()))[0], options.family)),
+            metadata=options.apply_to(file_metadata(next(iter(splits.values()))[0], options)),
             splits={name: partial(_read_files, files) for name, files in splits.items()},
             counts={name: sum(map(len, files)) for name, files in splits.items()},
         )
 
 
-def file_metadata(split: Split, family: str | None) -> Metadata:
-    """The metadata of a file's scene, which its trajectories describe, or else those beside it."""
+def file_metadata(split: Split, options: Options) -> Metadata:
+    """The metadata of a file's scene, which its trajectories describe, or else those beside it.
+
+    Of the options, only names of types are used, where the files have none.
+    """
     attributes = split.attributes(0)
     if "scene" in attributes:
         return described_metadata(attributes, split.path, split.frames(0))
-    return read_metadata(split.path.parent, family)
+    return read_metadata(split.path.parent, options.family, options.types)
+
+
+def with_family(options: Options, split: Split) -> Options:
+    """The options, with the family that the type ids of a file's first trajectory are of where nothing names them."""
+    try:
+        file_metadata(split, options)
+    except NmpmError:
+        return replace(options, family=options.family or unambiguous_family(split.particle_type(0)))
+    return options
 
 
 def _read_files(splits: list[Split]) -> Iterator[Trajectory]:

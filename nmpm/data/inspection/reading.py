@@ -95,7 +95,8 @@ def _read_metadata(
         "particle_types": {i: f"type {i}" for i in ids},
     }
     # Of a file that cannot be read, no key needs to be named.
-    metadata = parse_metadata(plain, path, source.options.family, [] if stated is None else problems, substitutes)
+    family, unread = source.options.family, stated is None
+    metadata = parse_metadata(plain, path, family, None, [] if unread else problems, substitutes)
     if missing := [key for key in ("bounds", "dt") if key not in plain]:
         problems.append(f"{path}: without {' and '.join(missing)}, lengths and times here are the file's own units.")
     return metadata, problems

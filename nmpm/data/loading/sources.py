@@ -10,14 +10,15 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from nmpm.data.convert import Options, native_folder
+from nmpm.data.convert.native import with_family
 from nmpm.data.format import Metadata, Split, is_native, read_metadata
 from nmpm.data.hub import hub_folder
 from nmpm.data.loading.buffer import RecordingProvider
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.window_plan import WindowPlan
 from nmpm.data.scene_inference import infer_scene
-from nmpm.data.split_files import find_split, split_renames
-from nmpm.errors import ConfigError
+from nmpm.data.split_files import find_split, split_paths, split_renames
+from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Reading, Scene
 
 SourceName = Literal["disk", "simulate", "hub"]
@@ -56,22 +57,26 @@ class DataSource(abc.ABC):
         """The metadata of the folder."""
         return read_metadata(self.folder)
 
+    def split(self, name: str) -> Split:
+        """The file of the split "train", "valid" or "test"; raises a DataError if it is missing."""
+        return Split(find_split(self.folder, name))
+
     def recordings(self, name: str, reading: Reading | None = None) -> SplitRecordings:
-        """The trajectories of the split "train", "valid" or "test", as they are unless a reading is given.
+        """The trajectories of a split, as they are unless a reading is given.
 
         Raises:
             DataError: if its file is missing.
         """
         held_out = self.holds_out and name == "valid"
-        path = find_split(self.folder, "train" if held_out else name)
-        recordings = SplitRecordings(Split(path), self.metadata, reading or Reading(self.scene))
+        split = self.split("train" if held_out else name)
+        recordings = SplitRecordings(split, self.metadata, reading or Reading(self.scene))
         if not self.holds_out or name == "test":
             return recordings
         if len(recordings) > 1:
             return recordings.subset(recordings.indices[-1:] if held_out else recordings.indices[:-1])
         end = recordings.split.frames(0) * 4 // 5
         span = slice(end, None) if held_out else slice(end)
-        return SplitRecordings(Split(path, span), self.metadata, recordings.reading)
+        return SplitRecordings(Split(split.path, span), self.metadata, recordings.reading)
 
     def training_data(self, length: int, reading: Reading, **plan: Any) -> tuple[RecordingProvider, WindowPlan]:
         """The trajectories to train on, and which of their windows make up which batch.
@@ -110,16 +115,29 @@ class FolderSource(DataSource):
 
     @cached_property
     def metadata(self) -> Metadata:
-        return self._unapplied.apply_to(read_metadata(self.folder, self._unapplied.family))
+        facts = self._unapplied
+        return facts.apply_to(read_metadata(self.folder, facts.family, facts.types))
 
     @cached_property
     def scene(self) -> Scene:
         return infer_scene(self.folder, self._unapplied)
 
-    @property
+    @cached_property
     def _unapplied(self) -> Options:
         """Options that the folder's metadata do not have yet: of a converted copy none."""
-        return self.options if self.folder == self.path else Options()
+        if self.folder != self.path:
+            return Options()
+        paths = split_paths(self.folder)
+        return with_family(self.options, Split(next(iter(paths.values())))) if paths else self.options
+
+    def split(self, name: str) -> Split:
+        paths = split_paths(self.folder)
+        if self.folder != self.path and name not in paths:
+            raise DataError(
+                f"{self.path}: no trajectories for {name}, only for {', '.join(paths)}. Files or folders called {name}"
+                " hold them."
+            )
+        return super().split(name)
 
 
 def hold_out(source: DataSource) -> DataSource:

@@ -14,15 +14,13 @@ import torch
 
 from nmpm._support.messages import suggestion
 from nmpm.data.catalog import catalog, dataset_folder, ensure, find_simulated
-from nmpm.data.format import Split, read_metadata
+from nmpm.data.convert import Options
 from nmpm.data.generate import generate
 from nmpm.data.loading.padded_batch import collate, displacements
 from nmpm.data.loading.recording import Recording, SplitRecordings
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.motion import measure_motion
-from nmpm.data.scene_inference import infer_scene
 from nmpm.data.simulation import SimulationRequest
-from nmpm.data.split_files import find_split
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Window
 from nmpm.scene import Motion, Reading, Scene
@@ -44,7 +42,7 @@ class Scenes:
         recordings: The trajectories, of at least 3 frames.
         preset: The simulator that made them; None if they were recorded, or made by an unknown simulator.
         seeds: Of each trajectory's initial state in the preset; empty without preset.
-        folder: Of the dataset, to measure speeds; None where they are not known.
+        source: Of the dataset, to measure speeds; None where they are not known.
     """
 
     name: str
@@ -52,7 +50,7 @@ class Scenes:
     recordings: tuple[Recording, ...]
     preset: Preset | None = None
     seeds: tuple[int, ...] = ()
-    folder: Path | None = None
+    source: FolderSource | None = None
 
     def __len__(self) -> int:
         return len(self.recordings)
@@ -79,7 +77,7 @@ class Scenes:
     @cached_property
     def motion(self) -> Motion | None:
         """How the particles of the dataset move; None where that is not known."""
-        return None if self.folder is None else measure_motion(self.folder, read_metadata(self.folder))
+        return None if self.source is None else measure_motion(self.source.folder, self.source.metadata)
 
     @cached_property
     def digests(self) -> tuple[str, ...]:
@@ -105,22 +103,36 @@ def moving_frames(recording: Recording, scene: Scene) -> int:
     return int(moving[-1]) + 1 if len(moving) else 1
 
 
-def find_scenes(dataset: str, count: int) -> Scenes:
+def find_scenes(dataset: str, count: int, facts: Options | None = None) -> Scenes:
     """Test scenes of an embedded dataset or of data of any format that is read, `count` at most; simulated if missing.
 
+    Args:
+        dataset: Name, or path.
+        count: Of scenes.
+        facts: That files do not state.
+
     Raises:
-        ConfigError: if there is no such dataset.
+        ConfigError: if there is no such dataset, or facts are stated of simulated scenes.
         DataError: if its files are missing or wrong.
     """
+    facts = facts or Options()
     if dataset in catalog():
+        _check_unstated(dataset, facts)
         folder = find_simulated(dataset, count) or ensure(dataset, {"train": 0, "valid": 0, "test": count})
-        return read_scenes(dataset, folder, count)
+        return read_scenes(dataset, FolderSource(folder), count)
     if not Path(dataset).exists():
         raise ConfigError(
             f"{dataset} is neither a file or folder nor an embedded dataset: {', '.join(catalog())}."
             f"{suggestion(dataset, catalog())}"
         )
-    return read_scenes(Path(dataset).name, FolderSource(Path(dataset)).folder, count)
+    return read_scenes(Path(dataset).name, FolderSource(Path(dataset), facts), count)
+
+
+def _check_unstated(name: str, facts: Options) -> None:
+    """Raise ConfigError if facts are stated of simulated scenes."""
+    stated = [fact for fact, value in vars(facts).items() if value is not None]
+    if stated:
+        raise ConfigError(f"--{stated[0]}: the scenes of {name} are simulated, and its facts known: leave it out.")
 
 
 def find_wider_scenes(dataset: str, count: int, times: int) -> Scenes:
@@ -138,25 +150,27 @@ def find_wider_scenes(dataset: str, count: int, times: int) -> Scenes:
     name = f"{dataset}-{times}-times-as-wide"
     folder = dataset_folder(name, request)
     generate(preset, folder, request.counts, request.seed)
-    return read_scenes(name, folder, count)
+    return read_scenes(name, FolderSource(folder), count)
 
 
-def read_scenes(name: str, folder: Path, count: int) -> Scenes:
-    """The first `count` test trajectories of a dataset in native layout; fewer where the split has fewer.
+def read_scenes(name: str, source: FolderSource, count: int) -> Scenes:
+    """The first `count` test trajectories of a dataset; fewer where the split has fewer.
 
     Raises:
         DataError: if files are missing or wrong.
-        ConfigError: if the simulator's scenes are others than the dataset's.
+        ConfigError: if the simulator's scenes are others than the dataset's, or facts are stated of them.
     """
-    metadata = read_metadata(folder)
+    metadata = source.metadata
     simulation = metadata.extra.get("simulation")
     plain = simulation.get("preset") if isinstance(simulation, dict) else None
     preset = None if plain is None else preset_from_dict(plain)
-    scene = infer_scene(folder) if preset is None else preset.scene
-    split = Split(find_split(folder, "test"))
+    if preset is not None:
+        _check_unstated(name, source.options)
+    scene = source.scene if preset is None else preset.scene
+    split = source.split("test")
     recordings = SplitRecordings(split, metadata, Reading(scene)).with_frames(3, "an evaluation")
     indices = recordings.indices[:count]
-    scenes = Scenes(name, scene, tuple(map(recordings.__getitem__, range(len(indices)))), preset, folder=folder)
+    scenes = Scenes(name, scene, tuple(map(recordings.__getitem__, range(len(indices)))), preset, source=source)
     if preset is None:
         return scenes
     seeds: list[Any] = [split.attributes(index).get("seed") for index in indices]

@@ -7,6 +7,7 @@ import torch
 
 from nmpm.data.generate import generate
 from nmpm.data.loading.recording import Recording
+from nmpm.data.loading.sources import FolderSource
 from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.evaluation.trade import Kind, Point, Scenes, Sweep, read_scenes, read_sweep
@@ -28,7 +29,7 @@ def tiny_scenes(folder):
     """Two test scenes of goop on a coarse grid, of ten frames."""
     preset = dataclasses.replace(load_preset("goop").coarsened(4).with_frames(10), substeps=6)
     generate(preset, folder, {"train": 0, "valid": 0, "test": 2}, workers=1)
-    return read_scenes("tiny", folder, 2)
+    return read_scenes("tiny", FolderSource(folder), 2)
 
 
 def tiny_emulator(scene):
