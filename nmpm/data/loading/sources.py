@@ -154,7 +154,8 @@ def hold_out(source: DataSource) -> DataSource:
         find_split(source.folder, "valid")  # raises, and says how to rename it
     source = replace(source, holds_out=True)
     held = source.recordings("valid")
-    rank_zero_info(f"No valid.h5: {held.split.where(held.indices[0])}, validates and is not trained on.")
+    where = held.split.where(held.indices[0]).removeprefix(f"{held.split.path.parent}/")
+    rank_zero_info(f"{source.description} has no valid split: {where}, validates and is not trained on.")
     return source
 
 
