@@ -80,8 +80,8 @@ class TrajectoryDataModule(LightningDataModule):
         reading: How the data are read for a model, see `nmpm.scene.Reading`, as plain data.
 
     Attributes:
-        validated: Trajectories, the first of the valid split, that validations of a training use where `limit_eval`
-            does not say it; None before that is decided, and for all. Kept in checkpoints.
+        validated: How many trajectories, the first ones, validate in a training where `limit_eval` does not say it;
+            None before that is decided, and for all. Kept in checkpoints.
 
     Raises:
         ConfigError: if neither `path` nor `name` is given, options contradict each other, or a number is not positive.
@@ -169,13 +169,11 @@ class TrajectoryDataModule(LightningDataModule):
         """Resets the position in the plan, unless a checkpoint is resumed, and looks at all that a training reads.
 
         Raises:
-            DataError: if a split cannot be evaluated or, at the first or last frame of a trajectory, be read; or if
-                nothing is left to validate on.
+            DataError: if a split cannot be evaluated, or not be read at the ends of its trajectories, or is missing.
         """
         if stage != "fit":
             return
-        if not self.batches_seen:
-            self._history = None
+        self._history = self._history if self.batches_seen else None
         present = split_paths(self.data_source.folder)
         if "valid" not in present and self.trainer is not None and self.trainer.enable_validation:
             self.data_source = hold_out(self.data_source)
@@ -257,13 +255,10 @@ class TrajectoryDataModule(LightningDataModule):
         """Whole trajectories of the test split."""
         return self._evaluation("test")
 
-    def predict_dataloader(self) -> EvaluationLoader:
-        """Whole trajectories of the test split."""
-        return self._evaluation("test")
+    predict_dataloader = test_dataloader
 
     def _evaluation(self, name: str, limit: int | None = None) -> EvaluationLoader:
-        rank, world = self.ranks
-        return EvaluationLoader(self.recordings(name), self.eval_batch_size, limit, rank, world, self.target_device)
+        return EvaluationLoader(self.recordings(name), self.eval_batch_size, limit, *self.ranks, self.target_device)
 
     @property
     def ranks(self) -> tuple[int, int]:
@@ -277,8 +272,7 @@ class TrajectoryDataModule(LightningDataModule):
             return 0
         # Only `processed` is right in every checkpoint: `ready` counts a batch that was interrupted, `completed`
         # misses the batch after which the checkpoint was written.
-        total = self.trainer.fit_loop.epoch_loop.batch_progress.total
-        return int(total.processed)  # type: ignore[attr-defined]  # (of batches)
+        return int(self.trainer.fit_loop.epoch_loop.batch_progress.total.processed)  # type: ignore[attr-defined]
 
 
 class TrainingLoader:

@@ -108,9 +108,8 @@ class ReportWriter(Callback):
         _write_report(folder, figures)
         self._print_progress()
         _print_table(f"{figures['dataset']}: test", figures["test"])
-        _write_curves(
-            folder / "errors.csv", {kind: curves for kind, (_, curves) in errors.items()}, pl_module.reading.every
-        )
+        curves = {kind: values for kind, (_, values) in errors.items()}
+        _write_curves(folder / "errors.csv", curves, pl_module.reading.every)
         if self._first_rollout is not None:
             trajectories = labelled_trajectories(pl_module.emulator.scene, *self._first_rollout)
             write_snapshots(trajectories, folder / "rollout.png")

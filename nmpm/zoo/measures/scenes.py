@@ -71,9 +71,8 @@ def _simulate(model: Pretrained, frames: int | None) -> Iterator[Window]:
 def as_recording(model: Pretrained, preset: Preset, run: SimulatedTrajectory, seed: int) -> Recording:
     """A simulated trajectory as a recording of the model's scene."""
     stored = Trajectory(run.position, run.particle_type, run.attributes)
-    return RecordingReader(preset_metadata(preset), Reading(model.scene)).recording(
-        stored, f"{preset.name}, seed {seed}"
-    )
+    reader = RecordingReader(preset_metadata(preset), Reading(model.scene))
+    return reader.recording(stored, f"{preset.name}, seed {seed}")
 
 
 def simulator_of(model: Pretrained) -> Preset | None:
