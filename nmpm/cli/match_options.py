@@ -1,7 +1,4 @@
-"""Options of data that a model meets: how it reads those of another kind than its own, and facts that files lack.
-
-They are read without torch.
-"""
+"""Options that say how a model reads data of another kind than its own; they are read without torch."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ from collections.abc import Mapping
 from fractions import Fraction
 from typing import TYPE_CHECKING, NamedTuple
 
-from nmpm.cli.options import add_data_options, parse_option
+from nmpm.cli.options import parse_option
 
 if TYPE_CHECKING:
     from nmpm.emulator.similarity import Match
@@ -25,16 +22,15 @@ STRICT = "refuse data that are not of the model's kind in gravity, frames, parti
 
 
 def add_match_options(parser: argparse.ArgumentParser) -> None:
-    """Add --materials, --stride and --strict, and the options of `add_data_options`."""
+    """Add --materials, --stride and --strict."""
     add_reading_options(parser).add_argument("--strict", action="store_true", help=STRICT)
 
 
 def add_reading_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
-    """As `add_match_options`, without --strict; returns the group of the first two."""
+    """Add --materials and --stride."""
     group = parser.add_argument_group("data of another kind than the model's")
     group.add_argument("--materials", metavar="DATA=MODEL,...", help=MATERIALS)
     group.add_argument("--stride", metavar="K", help=STRIDE)
-    add_data_options(parser)
     return group
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from nmpm.cli.match_options import MatchOptions, add_match_options
 from nmpm.cli.options import (
     HelpFormatter,
+    add_data_options,
     add_device_option,
     add_model_options,
     add_out_option,
@@ -114,6 +115,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_split_option(parser, "--data")
     add_match_options(parser)
+    add_data_options(parser)
     parser.add_argument("--trajectory", type=int, default=0, help="index in --data (default: 0, the first)")
     parser.add_argument("--seed", type=int, default=0, help="of the thrown blocks (default: 0)")
     parser.add_argument("--particles", type=int, default=1000, help="approximate number to throw (default: 1000)")

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm.cli.match_options import MatchOptions, add_match_options, describe
 from nmpm.cli.options import (
     HelpFormatter,
     add_device_option,
@@ -23,6 +24,7 @@ from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
     from nmpm.evaluation.stress import Effort, ModelUnderTest, TestResult
+    from nmpm.sim import Preset
 
 DESCRIPTION = """Test a trained model at the extremes: long rollouts, settling, fast and slow, many and few particles,
 other boxes and grids, precision, sensitivity, obstacles that training never showed, non-finite input. Prints one line
@@ -35,6 +37,7 @@ examples:
   nmpm stress goop --groups long settling   some of them
   nmpm stress runs/goop --free              a run's best checkpoint, without constraints
   nmpm stress goop --full --report stress   longer and larger, with a table and a picture
+  nmpm stress multimaterial --preset sandramps   on another simulator's scenes
 """
 
 
@@ -43,6 +46,9 @@ def run(words: list[str]) -> None:
     arguments = _parser().parse_args(words[1:])
     check_device(arguments.device)
     check_at_least("--threads", arguments.threads, 1)
+    stated = MatchOptions.read(arguments.materials, arguments.stride, arguments.strict)
+    if stated != MatchOptions() and not arguments.preset:
+        raise ConfigError("--materials, --stride and --strict are about the scenes of a --preset: give it too.")
     if arguments.report is not None:
         check_folder("--report", arguments.report)
     from nmpm.evaluation.stress import FULL, GROUPS, QUICK
@@ -50,7 +56,7 @@ def run(words: list[str]) -> None:
     unknown = sorted(set(arguments.groups or ()) - set(GROUPS))
     if unknown:
         raise ConfigError(f"--groups {' '.join(unknown)}: the groups are {', '.join(GROUPS)}.")
-    model = _load(arguments)
+    model = _load(arguments, stated)
     start = time.monotonic()
     results = _run_groups(model, FULL if arguments.full else QUICK, arguments.groups or list(GROUPS))
     _print_report(model, results, "full" if arguments.full else "quick", time.monotonic() - start, arguments)
@@ -69,7 +75,12 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--full", action="store_true", help="longer and larger: tens of minutes (default: minutes, as zoo cards quote)"
     )
-    parser.add_argument("--preset", help="simulator of its scenes (default: of the training data; none if recorded)")
+    parser.add_argument(
+        "--preset",
+        help="simulator of the scenes (default: of the training data; none if recorded); scenes of another kind than"
+        " the model's are matched to it, as by nmpm rollout",
+    )
+    add_match_options(parser)
     parser.add_argument("--free", action="store_true", help="without the model's constraints: the network alone")
     parser.add_argument(
         "--groups",
@@ -89,7 +100,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _load(arguments: argparse.Namespace) -> ModelUnderTest:
+def _load(arguments: argparse.Namespace, stated: MatchOptions) -> ModelUnderTest:
     from nmpm.evaluation.stress import ModelUnderTest
     from nmpm.sim import load_preset
     from nmpm.zoo import load_model
@@ -102,9 +113,20 @@ def _load(arguments: argparse.Namespace) -> ModelUnderTest:
             f"{arguments.model}: these tests are of closed boxes, and the model's scenes have open axes."
             " `nmpm compare` and `nmpm rollout --data` measure it on recordings."
         )
-    preset = load_preset(arguments.preset) if arguments.preset else simulator_of(model)
     emulator = model.emulator.unconstrained() if arguments.free else model.emulator
-    return ModelUnderTest(arguments.model, emulator, model.horizon, preset, arguments.seed)
+    tested = ModelUnderTest(arguments.model, emulator, model.horizon, simulator_of(model), arguments.seed)
+    return _match(tested, load_preset(arguments.preset), stated, arguments.json) if arguments.preset else tested
+
+
+def _match(model: ModelUnderTest, preset: Preset, stated: MatchOptions, json: bool) -> ModelUnderTest:
+    """The model on a preset's scenes; what matches them, where they are of another kind, is printed."""
+    from nmpm.emulator.similarity import find_match
+
+    match = find_match(model.emulator, preset.scene, None, *stated, names=(model.name, preset.name))
+    matched = model.over(preset, match)
+    if matched.reading is not None:
+        (sys.stderr if json else sys.stdout).write(describe(match, model.name))
+    return matched
 
 
 def _run_groups(model: ModelUnderTest, effort: Effort, groups: list[str]) -> list[TestResult]:

@@ -12,6 +12,7 @@ from nmpm.cli.match_options import MatchOptions, add_match_options
 from nmpm.cli.options import (
     MODEL,
     HelpFormatter,
+    add_data_options,
     add_device_option,
     check_at_least,
     check_device,
@@ -86,6 +87,7 @@ def add_scene_options(parser: argparse.ArgumentParser, command: str, scenes: int
     parser.add_argument("--out", type=Path, metavar="DIR", help=f"folder to write to (default: {command}/DATASET)")
     add_device_option(parser)
     add_match_options(parser)
+    add_data_options(parser)
 
 
 def measure_and_report(command: str, options: argparse.Namespace, dataset: str) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nmpm.cli.match_options import MatchOptions, add_reading_options
-from nmpm.cli.options import check_exists, data_options, derived_name, stated_facts
+from nmpm.cli.options import add_data_options, check_exists, data_options, derived_name, stated_facts
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -35,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("data", type=Path, help="a dataset, of any format that nmpm convert reads")
     add_reading_options(parser)
+    add_data_options(parser)
 
 
 def match(options: argparse.Namespace) -> None:

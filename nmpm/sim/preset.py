@@ -7,6 +7,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -199,6 +200,11 @@ class Preset(abc.ABC):
     def with_frames(self, frames: int) -> Self:
         """The same with another number of frames; ConfigError if it is not a positive whole number."""
         return dataclasses.replace(self, frames=check_whole("frames", frames, 1))
+
+    def with_stride(self, stride: Fraction) -> Self:
+        """The same scenes with `stride` of these frames as one, as long in time and with substeps no longer."""
+        frames, least = max(1, round(self.frames / stride)), math.ceil(self.substeps * stride)
+        return self._with_stable_substeps(least, frames=frames, frame_dt=float(self.frame_dt * stride))
 
     def to_dict(self) -> dict[str, Any]:
         """The preset as plain lists, strings and numbers, laid out as in its file."""

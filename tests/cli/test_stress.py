@@ -14,6 +14,18 @@ def test_one_group_of_a_zoo_model_as_json(capsys, tmp_path):
     assert json.loads((tmp_path / "stress.json").read_text()) == plain
 
 
+def test_scenes_of_another_simulator_are_matched(capsys):
+    assert main(["stress", "goop", "--preset", "sandramps", "--groups", "poison", "--json"]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["lines"]
+    assert "goop takes these data as follows." in said.err
+    assert "sand -> goop" in said.err
+    assert main(["stress", "goop", "--preset", "goop", "--groups", "poison"]) == 0
+    assert "as follows" not in capsys.readouterr().out
+    assert main(["stress", "goop", "--stride", "2"]) == 1
+    assert "--stride and --strict are about the scenes of a --preset" in capsys.readouterr().err
+
+
 def test_a_table_for_people(capsys):
     assert main(["stress", "waterdrop", "--groups", "poison"]) == 0
     out = capsys.readouterr().out

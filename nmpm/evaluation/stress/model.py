@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 
 import torch
 
@@ -15,6 +17,7 @@ from nmpm.data.loading.recording import Recording, RecordingReader
 from nmpm.data.simulation import try_seeds
 from nmpm.emulator import Emulator
 from nmpm.emulator.calibration import with_usual_gravity
+from nmpm.emulator.similarity import Match
 from nmpm.particles import Particles, Window
 from nmpm.scene import Reading
 from nmpm.sim import Preset
@@ -31,8 +34,9 @@ class ModelUnderTest:
         name: Its name in reports.
         emulator: In evaluation mode, on the device that the battery runs on.
         horizon: Frames that its training unrolled.
-        preset: The simulator of its training data; None where they were recorded.
+        preset: The simulator of its scenes; None where they were recorded.
         seed: Of the scenes.
+        reading: How it takes those of a preset of another kind, whose frames are its own; as they are when None.
     """
 
     name: str
@@ -40,6 +44,32 @@ class ModelUnderTest:
     horizon: int
     preset: Preset | None = None
     seed: int = 0
+    reading: Reading | None = None
+
+    def over(self, preset: Preset, match: Match) -> ModelUnderTest:
+        """The same test on the scenes of another preset, with a match of the emulator with them."""
+        reading = match.reading
+        if reading.is_plain and reading.scene == preset.scene:
+            return replace(self, preset=preset)
+        stride = Fraction(reading.every, reading.between)
+        return replace(
+            self,
+            emulator=self.emulator.matched(match),
+            preset=preset if stride == 1 else preset.with_stride(stride),
+            reading=Reading(reading.scene, reading.materials),
+        )
+
+    def read(self, preset: Preset) -> Reading:
+        """How scenes of a variant of the preset are read: in the model's materials, on whole cells."""
+        scene = preset.scene
+        if self.reading is None or self.preset is None:
+            return Reading(scene)
+        usual, domain = self.reading.scene, []
+        sides = zip(usual.domain, self.preset.scene.bounds, scene.bounds, self.emulator.grid.spacing, strict=True)
+        for (first, last), (_, high), (_, higher), h in sides:
+            domain.append((first, last + h * max(0, math.ceil((higher - high) / h - 1e-6))))
+        scene = replace(usual, bounds=scene.bounds, domain=tuple(domain), gravity=scene.gravity)
+        return replace(self.reading, scene=scene)
 
     @property
     def device(self) -> torch.device:
@@ -70,8 +100,9 @@ def simulate_window(model: ModelUnderTest, preset: Preset, count: int, frames: i
     Raises:
         UnstableError: if the simulator does not stay stable from several seeds in a row.
     """
-    recordings = [recording for entropy in model.entropies(count) for recording in _record(preset, entropy, frames, ())]
-    return collate(recordings, Reading(preset.scene)).to(model.device)
+    reading = model.read(preset)
+    made = [_record(preset, reading, entropy, frames, ()) for entropy in model.entropies(count)]
+    return collate([recording for recordings in made for recording in recordings], reading).to(model.device)
 
 
 def simulate_beside(
@@ -81,14 +112,17 @@ def simulate_beside(
 
     A scene in which any of them becomes unstable is replaced by another.
     """
+    reading = model.read(preset)
     for entropy in model.entropies(count):
-        recordings = _record(preset, entropy, frames, others)
-        yield [collate([recording], Reading(preset.scene)).to(model.device) for recording in recordings]
+        recordings = _record(preset, reading, entropy, frames, others)
+        yield [collate([recording], reading).to(model.device) for recording in recordings]
 
 
-def _record(preset: Preset, entropy: tuple[int, ...], frames: int, others: Sequence[Preset]) -> list[Recording]:
+def _record(
+    preset: Preset, reading: Reading, entropy: tuple[int, ...], frames: int, others: Sequence[Preset]
+) -> list[Recording]:
     """One scene as the preset and others simulate it, from the first seed with which all stay stable."""
-    reader = RecordingReader(preset_metadata(preset), Reading(preset.scene))
+    reader = RecordingReader(preset_metadata(preset), reading)
 
     def simulate(seed: int) -> list[Recording]:
         start = preset.draw(seed)

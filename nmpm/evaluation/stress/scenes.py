@@ -133,7 +133,7 @@ def _wide(model: ModelUnderTest, times: int, effort: Effort) -> TestResult:
     name = f"domain {times} × as wide"
     if model.preset is not None:
         preset = model.preset.widened(times)
-        window, scene = simulate_window(model, preset, effort.scenes, effort.compared), preset.scene
+        window, scene = simulate_window(model, preset, effort.scenes, effort.compared), model.read(preset).scene
     else:
         window, scene = Window.of(model.starts(1)), model.emulator.scene
         longer = (times - 1) * (scene.domain[0][1] - scene.domain[0][0])

@@ -2,6 +2,7 @@ import dataclasses
 import importlib
 import json
 import math
+from fractions import Fraction
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from nmpm.data.simulation import seed_of_draw
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.input_checks import beyond_walls
+from nmpm.emulator.similarity import find_match
 from nmpm.errors import UnstableError
 from nmpm.evaluation.stress import GROUPS, Effort, ModelUnderTest, battery, results
 from nmpm.evaluation.stress.model import simulate_beside, simulate_window
@@ -41,6 +43,27 @@ def goop(**options) -> ModelUnderTest:
         blocks=dataclasses.replace(load_preset("goop").blocks, particles=(200, 260), number=(1, 1)),
     )
     return ModelUnderTest("tiny", emulator_of(preset.scene, 64, **options), 8, preset)
+
+
+def test_a_model_is_tested_on_scenes_of_another_kind():
+    """Here sand in a wider box, in frames half as long; the simulator's are then the model's."""
+    model, layout = goop(), load_preset("sandramps")
+    blocks = dataclasses.replace(layout.blocks, particles=(200, 260), number=(1, 1))
+    preset = dataclasses.replace(layout, frames=20, blocks=blocks)
+    preset = preset.widened(2).with_stride(Fraction(1, 2))
+    match = find_match(model.emulator, preset.scene, stride=Fraction(2))
+    other = model.over(preset, match)
+    assert other.preset.scene.dt == pytest.approx(model.preset.scene.dt)
+    assert other.preset.frames == 20
+    window = simulate_window(other, other.preset, 2, 5)
+    assert window.target.shape[1] == 5
+    assert window.initial.material.max() == 0  # goop to the model
+    assert set(window.initial.obstacle.shape[1:]) != {0}
+    groups = {name: GROUPS[name] for name in ("speeds", "sizes", "settling")}
+    results = {result.name: result for result in battery(other, TINY, groups)}
+    for name in ("initial speed × 1", "gravity × 2", "domain 2 × as wide", "grid refined"):
+        assert 0 < results[name].figures["mse"] < 10 * results[name].figures["mse_nothing_moves"], name
+    assert model.over(model.preset, find_match(model.emulator, model.preset.scene)).reading is None
 
 
 def recorded() -> ModelUnderTest:
