@@ -78,9 +78,9 @@ def run_again(function, _):
 def triton(monkeypatch, device):
     """Lets emulators take the runtime; without a GPU in Triton's interpreter, and without a graph."""
     pytest.importorskip("triton", reason="triton is not installed")
-    from nmpm.emulator.engines.triton import steps
+    from nmpm.emulator.engines.triton import engine
 
-    monkeypatch.setattr(steps, "_BLOCK", 64)  # more than one program for each scene
+    monkeypatch.setattr(engine, "_BLOCK", 64)  # more than one program for each scene
     if device.type != "cuda":
         if torch.cuda.is_available():
             pytest.skip("kernels are compiled for the GPU: --device cuda")
