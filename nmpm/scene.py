@@ -177,14 +177,13 @@ class Scene:
     def differences(self, other: Scene) -> tuple[str, ...]:
         """Names of the facts that differ between a model's scene and its data's, and may not.
 
-        Names of materials, their densities and fields are not compared; volumes of particles, which may be estimates,
-        are compared to 5%.
+        Names of materials, their densities and fields are not compared.
         """
         facts = ("bounds", "domain", "dt", "boundary", "gravity", "gravity_varies", "obstacles", "moving_obstacles")
         different = [name for name in facts if getattr(self, name) != getattr(other, name)]
         if len(self.materials) != len(other.materials):
             different.append("materials")
-        if not math.isclose(self.particle_volume, other.particle_volume, rel_tol=0.05):
+        if not is_same_volume(self.particle_volume, other.particle_volume):
             different.append("particle_volume")
         return tuple(different)
 
@@ -276,6 +275,11 @@ class Motion:
     largest: float
     gravity: tuple[float, ...] | None = None
     frames: int | None = None
+
+
+def is_same_volume(one: float, other: float) -> bool:
+    """Whether volumes of particles, which may be estimates, agree to 5%."""
+    return math.isclose(one, other, rel_tol=0.05)
 
 
 def check_field_names(names: Iterable[str]) -> None:

@@ -20,10 +20,11 @@ from nmpm.data.gravity import check_gravity, trajectory_gravity
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.sources import FolderSource
+from nmpm.data.volumes import VOLUME
 from nmpm.emulator.fields import warn_of_ignored
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
-from nmpm.scene import Reading, Scene
+from nmpm.scene import Reading, Scene, is_same_volume
 from nmpm.zoo import Pretrained
 from nmpm.zoo.matching import match_data
 from nmpm.zoo.starts import is_gravity_of
@@ -88,17 +89,18 @@ class RecordedStart:
 
 
 def is_of_kind(scene: Scene, metadata: Metadata, split: Split, index: int) -> bool:
-    """Whether a trajectory is of the kind of a model's scene: in its materials, units, frames, box and gravity.
+    """Whether a trajectory can be read as one of a model's scene, as nothing that its file states is another.
 
-    Obstacles that move are of the kind of a scene that has such.
-
-    What could only be guessed, of a file that states nothing, decides nothing where the box may be the model's.
+    That is materials, obstacles, box, volume of particles, time between frames and gravity; bounds agree to a 64th of
+    the box, gravity, which may be measured, to 5%. What could only be guessed, of a file that states nothing, decides
+    nothing where the box may be the model's.
     """
     types = set(np.unique(split.particle_type(index)).tolist())
     names = {metadata.particle_types[i] for i in metadata.moving_types if i in types}
     if metadata.dim != scene.dim or not names <= set(scene.materials) or metadata.boundary != scene.boundary:
         return False
-    if metadata.prescribed_types & types and not scene.moving_obstacles:
+    obstacles, moving = types & metadata.obstacle_types, types & metadata.prescribed_types
+    if (obstacles and not scene.obstacles) or (moving and not scene.moving_obstacles):
         return False
     guessed = {name for name, how in metadata.extra.get(FOUND, {}).items() if str(how).startswith("guessed")}
     ours, theirs = np.array(scene.bounds if "bounds" not in guessed else scene.domain), np.array(metadata.bounds)
@@ -106,7 +108,12 @@ def is_of_kind(scene: Scene, metadata: Metadata, split: Split, index: int) -> bo
     within = (theirs[:, 0] > ours[:, 0] - cell).all() and (theirs[:, 1] < ours[:, 1] + cell).all()
     if not within or ("bounds" not in guessed and not np.allclose(theirs, ours, 0, cell)):
         return False
-    gravity = trajectory_gravity(split.attributes(index), metadata, split.where(index))
+    attributes, volume = split.attributes(index), metadata.particle_volume
+    if volume and VOLUME not in {*attributes, *guessed} and not is_same_volume(scene.particle_volume, volume):
+        return False
+    if scene.gravity_varies and "gravity" not in attributes:
+        return False  # the model is told that of each trajectory
+    gravity = trajectory_gravity(attributes, metadata, split.where(index))
     if not np.isclose(metadata.dt, scene.dt, rtol=1e-3):
         return gravity is None and "dt" in guessed
     return scene.gravity_varies or gravity is None or scene.gravity is None or is_gravity_of(scene, gravity)

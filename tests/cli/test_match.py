@@ -59,6 +59,27 @@ def test_a_rollout_takes_data_in_other_units_and_writes_their_frames_and_names(c
     assert json.loads(written.attributes["scene"])["dt"] == 2.5
 
 
+@pytest.mark.parametrize(
+    ("model", "statics", "changes", "line"),
+    [
+        ("goop", 0, {}, None),
+        ("goop", 0, {"particle_volume": 1e-4}, "particles"),
+        ("goop", 4, {}, "solid channel"),
+        ("universal", 0, {"bounds": Zoo.load("universal").scene.bounds}, "gravity"),
+    ],
+    ids=["same", "larger particles", "obstacles", "gravity of its own"],
+)
+def test_data_in_the_models_units_need_no_match_only_if_nothing_differs(model, statics, changes, line, capsys):
+    write_split(Path("grains", "test.h5"), [made_up_trajectory(8, 9, statics=statics)])
+    write_metadata(
+        Path("grains"), made_up_metadata(**({"particle_volume": Zoo.load("goop").scene.particle_volume} | changes))
+    )
+    assert main(["rollout", model, "--data", "grains"]) == 0
+    said = capsys.readouterr().out
+    assert ("as follows" in said) == (line is not None)
+    assert line is None or line in said
+
+
 def test_a_rollout_makes_frames_between_those_of_the_data_or_jumps_over_some(capsys):
     data = write_foreign(every=4)
     assert main(["rollout", "goop", "--data", str(data), "--out", "quarter.h5"]) == 0
