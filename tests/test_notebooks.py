@@ -28,7 +28,7 @@ PUBLIC = (
     "nmpm.zoo",
 )
 BUDGETS: dict[str, dict[str, object]] = {
-    "fine_tuning": {"STEPS": 2, "RUNS, FRAMES": (3, 40)},
+    "fine_tuning": {"STEPS": 30, "RUNS, FRAMES": (4, 80)},
     "inverse_design": {"STEPS": 1, "BATCH": 1, "LAST": 8, "MOMENT": 8, "FRAMES": 16},
     "new_processor": {"STEPS": 2, "COUNTS": {"train": 1, "valid": 1, "test": 1}, "FRAMES": 40},
     "quickstart": {"FRAMES": 16},
@@ -166,6 +166,8 @@ def test_your_own_data_become_a_film_and_a_model_that_anybody_can_load(run):
 def test_fine_tuning_takes_foreign_data_and_leaves_a_better_model_and_a_picture(run):
     names = run("fine_tuning")
     assert names["start"].match.reading.scene.materials == ("sand",)
-    assert names["overall"][0] >= min(names["overall"])
+    assert min(names["overall"]) < 0.6 * names["overall"][0]  # 0.2 to 0.3 as measured
+    mse = {name: float(curve.square().mean()) for name, curve in names["errors"].items()}
+    assert mse["as it is"] < 0.15 * mse["nothing moves"] > mse["fine-tuned"]
     assert all(len(curve) == names["frames"] for curve in names["errors"].values())
     assert Image.open("fine_tuned.png").width > 300
