@@ -16,6 +16,7 @@ from nmpm._support.plain_data import to_plain
 from nmpm.cli.early_checks import read_options, stated_keys
 from nmpm.cli.match_options import MATERIALS, STRICT, STRIDE, MatchOptions, describe
 from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.data.loading.sources import FolderSource
 from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.similarity import Match
 from nmpm.errors import ConfigError, NmpmError
@@ -72,6 +73,8 @@ class MatchedRun:
         if (start is None or config["ckpt_path"]) and checkpoint is None:
             return None
         data = TrajectoryDataModule(**config["data"].as_dict())
+        if checkpoint is None and isinstance(data.data_source, FolderSource):
+            data.data_source.split("train")  # refuses data without, before they are measured
         if checkpoint is not None and not ((stored := stored_scene(checkpoint)) and stored.differences(data.scene)):
             return None
         model = load_model(str(start)) if checkpoint is None else load_checkpoint(checkpoint)
@@ -82,7 +85,7 @@ class MatchedRun:
 
     def __str__(self) -> str:
         """Lines on how the model takes the data, and on what is left out of the configuration; none if neither."""
-        how = "" if self._is_same_kind else describe(self.match, self.model.name)
+        how = describe(self.match, self.model.name) if not self._is_same_kind or self.match.warnings else ""
         if not self.left_out:
             return how
         names = ", ".join(f"model.{name}" for name in self.left_out)
