@@ -12,6 +12,7 @@ from nmpm.grid import Grid
 from nmpm.particles import Particles
 from nmpm.scene import Scene
 from nmpm.transfer import Transfer
+from nmpm.transfer.transfer import divisors
 
 
 def grid_state(
@@ -28,7 +29,7 @@ def grid_state(
     if particles.volume is not None:
         membership = membership * particles.volume.to(cells.dtype).unsqueeze(-1)
     momentum, count = transfer.momentum(velocity, membership, cells, grid)
-    mean = momentum / _positive(count).repeat_interleave(scene.dim, dim=1)
+    mean = momentum / divisors(count).repeat_interleave(scene.dim, dim=1)
     volume = count * (scene.particle_volume / grid.cell_volume)
     parts = [mean, volume, solid]
     if scene.moving_obstacles:
@@ -38,7 +39,7 @@ def grid_state(
     if scales is not None and scene.particle_fields:
         values = scales.of_particles(particles)
         sums, count = transfer.sums(values, membership.to(values.dtype), cells, grid)
-        parts.append(sums / _positive(count).repeat_interleave(values.shape[-1], dim=1))
+        parts.append(sums / divisors(count).repeat_interleave(values.shape[-1], dim=1))
     if scales is not None and scene.parameters:
         parts.append(_constant(scales.of_scene(particles), grid))
     return torch.cat(parts, dim=1)
@@ -69,7 +70,7 @@ def solid_velocity(grid: Grid, transfer: Transfer, particles: Particles, dtype: 
         return cells.new_zeros(len(cells), grid.dim, *grid.shape)
     velocity = grid.to_cell_displacement(particles.obstacle_velocity, dtype)
     sums = transfer.p2g(torch.cat([velocity * volume, volume], dim=-1), cells, grid)
-    return sums[:, :-1] / _positive(sums[:, -1:])
+    return sums[:, :-1] / divisors(sums[:, -1:])
 
 
 def _obstacle_volumes(particles: Particles, dtype: torch.dtype) -> Tensor:
@@ -100,8 +101,3 @@ def wall_fraction(scene: Scene, grid: Grid) -> Tensor:
         share = (overlap / grid.spacing[axis]).clamp(0, 1) if scene.confined[axis] else torch.ones_like(overlap)
         free = free.unsqueeze(-1) * share
     return (1 - free).float().to(torch.get_default_device())
-
-
-def _positive(count: Tensor) -> Tensor:
-    """Counts that can be divided by; empty cells have no momentum, so any positive number gives them velocity zero."""
-    return torch.where(count > 0, count, torch.ones_like(count))

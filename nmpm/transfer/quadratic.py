@@ -24,7 +24,7 @@ from torch import Tensor
 
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.transfer.transfer import Stencil, Transfer, gather, inside, scatter, tensor_product
+from nmpm.transfer.transfer import Stencil, Transfer, divisors, gather, inside, scatter, tensor_product
 
 
 def quadratic_stencil(cells: Tensor, grid: Grid) -> Stencil:
@@ -108,7 +108,7 @@ class Affine(Quadratic):
         values = (membership[:, :, None, :, None] * terms.unsqueeze(-2)).flatten(-2)
         sums = _scattered(stencil, values, grid.size).unflatten(-1, (materials, -1))
         count, place_sum, moved_sum, square_sum, product_sum = sums.split([1, dim, dim, dim**2, dim**2], dim=-1)
-        total = _divisor(count)
+        total = divisors(count)
         mean, flow = place_sum / total, moved_sum / total
         variance = (square_sum / total).unflatten(-1, (dim, dim)) - mean.unsqueeze(-1) * mean.unsqueeze(-2)
         covariance = (product_sum / total).unflatten(-1, (dim, dim)) - flow.unsqueeze(-1) * mean.unsqueeze(-2)
@@ -125,13 +125,8 @@ def _own(slope: Tensor, count: Tensor, membership: Tensor, stencil: Stencil) -> 
     gathered = gather(stencil, weighted.reshape(batch, size, -1)).unflatten(-1, (materials, -1))
     weighted_sum: Tensor = (gathered * membership.unsqueeze(-1)).sum(dim=-2)
     summed, mass = weighted_sum.split([dim**2, 1], dim=-1)
-    mean: Tensor = (summed / _divisor(mass)).unflatten(-1, (dim, dim))
+    mean: Tensor = (summed / divisors(mass)).unflatten(-1, (dim, dim))
     return mean
-
-
-def _divisor(count: Tensor) -> Tensor:
-    """Numbers of particles, and 1 where so small a share of one is seen that gradients of quotients overflow."""
-    return torch.where(count > torch.finfo(count.dtype).tiny, count, torch.ones_like(count))
 
 
 def _scattered(stencil: Stencil, values: Tensor, size: int) -> Tensor:

@@ -21,6 +21,8 @@ from torch import Tensor
 from nmpm.grid import Grid
 from nmpm.transfer.execution import add, chunks
 
+_LEAST_SHARE = 1e-30  # of a particle
+
 
 @dataclass(frozen=True)
 class Stencil:
@@ -86,6 +88,11 @@ def gather(stencil: Stencil, field: Tensor) -> Tensor:
     index = stencil.node.reshape(batch, count * touches, 1).expand(-1, -1, channels)
     values = field.gather(1, index).reshape(batch, count, touches, channels)
     return torch.einsum("bnj,bnjc->bnc", stencil.weight, values)
+
+
+def divisors(count: Tensor) -> Tensor:
+    """Numbers of particles, and 1 where so small a share of one is seen that gradients of quotients would overflow."""
+    return torch.where(count > _LEAST_SHARE, count, 1.0)
 
 
 def tensor_product(base: Tensor, weights: list[Tensor], grid: Grid) -> Stencil:

@@ -8,12 +8,14 @@ import torch
 
 from nmpm.emulator import Emulator, differentiable_rollout
 from nmpm.emulator.bodies import sample_bodies, solid_share
+from nmpm.emulator.rasterise import grid_state
 from nmpm.errors import ConfigError, DataError
 from nmpm.grid import Grid
 from nmpm.obstacles import Body, Box, Disc, Polygon, Ramp, Sphere
 from nmpm.particles import Particles
 from nmpm.processors import UNet
 from nmpm.scene import Scene
+from nmpm.transfer import Quadratic
 from tests.scenes import box, cloud, emulator_of, with_obstacle
 
 FRAMES = 5  # of which the last bundle is cut
@@ -58,6 +60,19 @@ def loss(model: Emulator, particles: Particles) -> torch.Tensor:
     end = differentiable_rollout(model, particles, FRAMES)[:, -1]
     weight = torch.randn(end.shape[1:], dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     return 1e4 * (end * weight).sum()
+
+
+def test_gradients_are_finite_where_a_node_sees_next_to_nothing_of_a_lone_particle():
+    scene = box(3)
+    model = emulator_of(scene, 8, transfer=Quadratic())
+    cells = torch.full((1, 1, 3), 2.0).nextafter(torch.zeros(())).requires_grad_()  # at the rim of node 0's support
+    velocity = torch.ones(1, 1, 3, requires_grad=True)
+    state = grid_state(
+        scene, model.grid, model.transfer, cloud(scene, 1), cells, velocity, model.walls[None, None][:, :0]
+    )
+    assert 0 < state[0, 3, 0, 0, 0] < 1e-38
+    for slope in torch.autograd.grad(state[:, :3].square().sum(), (cells, velocity)):
+        assert slope.abs().max() < 1e9  # rounding over the distance to the rim
 
 
 # ---- bodies
