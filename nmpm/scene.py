@@ -261,18 +261,18 @@ class Reading:
 
 @dataclass(frozen=True)
 class Motion:
-    """How a dataset's particles move, as measured in some of its trajectories.
+    """How a dataset's particles move, as measured in some of its trajectories; None where that is unknown.
 
     Args:
         rms: Root mean square of their speeds, in length per frame of the dataset.
         largest: Speed that all but the fastest 0.1% stay below, likewise.
         gravity: In length per second squared; measured where the scene states none, and where it varies each
-            component's root mean square. None where it is unknown.
-        frames: Of the shortest trajectory; None where that is unknown.
+            component's root mean square.
+        frames: Of the shortest trajectory.
     """
 
-    rms: float
-    largest: float
+    rms: float | None = None
+    largest: float | None = None
     gravity: tuple[float, ...] | None = None
     frames: int | None = None
 

@@ -121,8 +121,9 @@ def _load(arguments: argparse.Namespace, stated: MatchOptions) -> ModelUnderTest
 def _match(model: ModelUnderTest, preset: Preset, stated: MatchOptions, json: bool) -> ModelUnderTest:
     """The model on a preset's scenes; what matches them, where they are of another kind, is printed."""
     from nmpm.emulator.similarity import find_match
+    from nmpm.scene import Motion
 
-    match = find_match(model.emulator, preset.scene, None, *stated, names=(model.name, preset.name))
+    match = find_match(model.emulator, preset.scene, Motion(), *stated, names=(model.name, preset.name))
     matched = model.over(preset, match)
     if matched.reading is not None:
         (sys.stderr if json else sys.stdout).write(describe(match, model.name))

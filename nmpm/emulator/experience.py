@@ -37,16 +37,12 @@ class Figures:
     spacing: float
 
     @classmethod
-    def of(cls, scene: Scene, motion: Motion | None, widths: Sequence[float], stride: Fraction) -> Figures:
+    def of(cls, scene: Scene, motion: Motion, widths: Sequence[float], stride: Fraction) -> Figures:
         """The figures on cells of some widths (D,), in the data's units, with so many frames of the data for one."""
         width, frames = mean_width(widths), float(stride)
-        gravity = gravity_in_cells(scene.gravity or (motion.gravity if motion else None), scene.dt, widths)
-        return cls(
-            gravity=None if gravity is None else gravity * frames**2,
-            rms=motion.rms * frames / width if motion else None,
-            largest=motion.largest * frames / width if motion else None,
-            spacing=width / scene.particle_spacing,
-        )
+        gravity = gravity_in_cells(scene.gravity or motion.gravity, scene.dt, widths)
+        rms, largest = (each and each * frames / width for each in (motion.rms, motion.largest))
+        return cls(gravity and gravity * frames**2, rms, largest, width / scene.particle_spacing)
 
     def scaled(self, factor: float) -> Figures:
         """The figures on cells wider by a factor."""

@@ -11,10 +11,8 @@ from nmpm.emulator.experience import Experience, Figures, clamp, mean_width
 from nmpm.emulator.recipe import EmulatorRecipe
 from nmpm.scene import Boundary, Scene
 
-FACTOR = 1.25
-"""Left-over factors of gravity beyond which there is a warning."""
-_SPEED_FACTOR, _SPACING_FACTOR = 2.0, 1.05
-"""Likewise of speeds, of which the model's are estimates, and of the spacing of particles."""
+_GRAVITY, _SPEED, _SPACING = 1.25, 2.0, 1.05
+"""Left-over factors beyond which there is a warning; the model's speeds are estimates."""
 _ALIGNED = 0.99  # cosine of the angle between two directions of gravity
 
 
@@ -44,102 +42,93 @@ class MatchReport:
 
     def lines(self) -> Iterator[str]:
         """Cells, frames, gravity and particles, a line each."""
-        recipe, figures, seen = self.recipe, self.figures, self.seen
-        scene, dim = recipe.scene, recipe.scene.dim
-        layers = [
-            (low - first) / h
-            for (low, _), (first, _), h in zip(scene.bounds, scene.domain, recipe.grid.spacing, strict=True)
-        ]
-        walls = [layer for layer, walled in zip(layers, scene.confined, strict=True) if walled]
+        recipe, figures, seen, scene = self.recipe, self.figures, self.seen, self.recipe.scene
+        sides = zip(scene.bounds, scene.domain, recipe.grid.spacing, scene.confined, strict=True)
+        walls = [f" with walls of {(low - first) / h:.2g} cells" for (low, _), (first, _), h, wall in sides if wall]
         yield (
             f"cells      1 cell = {mean_width(recipe.grid.spacing):.4g} length (model"
             f" {mean_width(self.model.grid.spacing):.4g}), {' x '.join(map(str, recipe.grid.shape))} cells"
-            + (f" with walls of {walls[0]:.2g} cells" if walls else "")
+            f"{''.join(walls[:1])}"
         )
         yield f"frames     1 frame of the model = {self.stride} of the data ({scene.dt:.4g} time)"
         yield f"gravity    {self._gravity_line()}"
-        few, many = (n**dim for n in seen.spacings)
-        usual = f"{few:.2g} to {many:.2g}" if self.model.particles_per_cell else f"{seen.spacing**dim:.3g}"
+        few, many = (n**scene.dim for n in seen.spacings)
+        usual = f"{few:.2g} to {many:.2g}" if seen.varied_spacing else f"{seen.spacing**scene.dim:.3g}"
         yield (
-            f"particles  {figures.spacing**dim:.3g} per cell (model {usual}); speeds up to {_number(figures.largest)}"
-            f" cells/frame (model {_number(seen.fastest)})"
+            f"particles  {figures.spacing**scene.dim:.3g} per cell (model {usual}); speeds up to"
+            f" {_number(figures.largest)} cells/frame (model {_number(seen.fastest)})"
         )
+
+    def _gravity_line(self) -> str:
+        figures, seen = self.figures, self.seen
+        unknown = "none" if self.scene.gravity_known else "unknown"
+        data = unknown if figures.gravity is None else f"{figures.gravity:.3g} cells/frame²"
+        weakest, strongest = seen.gravity or (None, None)
+        from_weakest = f"{weakest:.3g} to " if weakest and self.model.scene.gravity_varies else ""
+        both = f"{data}{' as measured' * self.measured} (model {from_weakest}{_number(strongest)})"
+        if figures.gravity and seen.gravity:
+            return f"{both}, factor {seen.motion_factor(figures):.3g}"
+        if figures.rms and seen.rms:
+            return f"{both}; by speeds, rms {figures.rms:.3g} cells/frame (model {seen.rms:.3g})"
+        return f"{both}; by the particles alone"
 
     def warnings(self) -> Iterator[str]:
         """What was left over, a sentence each with model, data and factor."""
-        if not self._same_units:
+        if not self._has_gravity_of_model:
             yield from self._gravity_warnings()
         yield from self._figure_warnings()
         yield from self._boundary_warnings()
 
     @property
-    def _same_units(self) -> bool:
+    def _has_gravity_of_model(self) -> bool:
         """Whether gravity and frames are the model's, number for number, on cells of its size."""
-        mine, theirs = self.model.scene, self.scene
-        alike = (mine.gravity, mine.gravity_varies, mine.dt) == (theirs.gravity, theirs.gravity_varies, theirs.dt)
+        same = {"dt", "gravity", "gravity_varies"}.isdisjoint(self.model.scene.differences(self.scene))
         widths = zip(self.model.grid.spacing, self.recipe.grid.spacing, strict=True)
-        return alike and all(math.isclose(a, b, rel_tol=1e-3) for a, b in widths)
-
-    def _gravity_line(self) -> str:
-        data, model = self.figures.gravity, self.seen.gravity
-        told = model and self.model.scene.gravity_varies
-        theirs = f"{model[0]:.3g} to {model[1]:.3g}" if model and told else _number(model and model[1])
-        none = "none" if self.scene.gravity_known else "unknown"
-        measured = " as measured" if self.measured else ""
-        both = f"{f'{data:.3g} cells/frame²' if data else none}{measured} (model {theirs})"
-        if data and model:
-            return f"{both}, factor {self.seen.motion_factor(self.figures):.3g}"
-        if self.figures.rms and self.seen.rms:
-            return f"{both}; by speeds, rms {self.figures.rms:.3g} cells/frame (model {self.seen.rms:.3g})"
-        return f"{both}; by the particles alone"
+        return same and all(math.isclose(a, b, rel_tol=1e-3) for a, b in widths)
 
     def _gravity_warnings(self) -> Iterator[str]:
-        model, data = self.names
-        figures, seen = self.figures, self.seen
+        (model, data), figures, seen = self.names, self.figures, self.seen
         factor = seen.motion_factor(figures)
         if figures.gravity and seen.gravity:
-            if not 1 / FACTOR <= factor <= FACTOR:
+            if not 1 / _GRAVITY <= factor <= _GRAVITY:
                 yield f"Gravity of {data} is {figures.gravity:.3g} cells/frame², {factor:.3g} times that of {model}."
             yield from self._direction_warnings()
             return
-        told = self.model.scene.gravity_varies
-        if not self.scene.gravity_known and (self.model.scene.gravity_known or told):
+        varies, mine, theirs = self.model.scene.gravity_varies, self.model.scene, self.scene
+        if not theirs.gravity_known and mine.gravity_known:
             yield f"Gravity of {data} is not known, that of {model} is: state it (gravity=…)."
-        elif figures.gravity is None and seen.gravity and not told and not self.scene.gravity_varies:
-            yield f"{data} has no gravity, but {model} learnt to fall by {seen.gravity[1]:.3g} cells/frame²."
-        elif self.scene.gravity_varies and not told:
+        elif theirs.gravity_varies and not varies:
             yield f"Gravity differs between the scenes of {data}; {model} has seen one."
-        elif figures.gravity and not told:
+        elif seen.gravity and not varies and not figures.gravity:
+            yield f"{data} has no gravity, but {model} learnt to fall by {seen.gravity[1]:.3g} cells/frame²."
+        elif figures.gravity and not varies:
             yield f"{data} has a gravity of {figures.gravity:.3g} cells/frame²; {model} has seen none."
         if figures.rms and seen.rms:
-            if not 1 / _SPEED_FACTOR <= factor <= _SPEED_FACTOR:
-                yield (
-                    f"Speeds of {data} are {figures.rms:.3g} cells/frame (rms), {factor:.3g} times those of {model}."
-                )
+            if not 1 / _SPEED <= factor <= _SPEED:
+                yield f"Speeds of {data} are {figures.rms:.3g} cells/frame (rms), {factor:.3g} times those of {model}."
         elif not figures.gravity:
             yield f"Neither gravity nor speeds of {data} are known: cells for {model} are chosen by particles alone."
 
     def _direction_warnings(self) -> Iterator[str]:
-        model, data = self.model.scene, self.scene
-        if model.gravity_varies:
+        (model, data), mine, theirs = self.names, self.model.scene, self.scene
+        if mine.gravity_varies:
             return
-        if data.gravity is None:
-            yield f"Gravity differs between the scenes of {self.names[1]}; {self.names[0]} has seen one."
-        elif model.gravity is not None and _cosine(model.gravity, data.gravity) < _ALIGNED:
+        if theirs.gravity is None:
+            yield f"Gravity differs between the scenes of {data}; {model} has seen one."
+        elif mine.gravity is not None and _cosine(mine.gravity, theirs.gravity) < _ALIGNED:
             yield (
-                f"Gravity of {self.names[1]} points along {list(data.gravity)}, that of {self.names[0]} along"
-                f" {list(model.gravity)}: turn the data."
+                f"Gravity of {data} points along {list(theirs.gravity)}, that of {model} along {list(mine.gravity)}:"
+                " turn the data."
             )
 
     def _figure_warnings(self) -> Iterator[str]:
         (model, data), figures, seen = self.names, self.figures, self.seen
-        factor = figures.spacing / clamp(figures.spacing, *seen.spacings)
-        if not 1 / _SPACING_FACTOR <= factor <= _SPACING_FACTOR:
+        factor, excess = figures.spacing / clamp(figures.spacing, *seen.spacings), seen.speed_excess(figures)
+        if not 1 / _SPACING <= factor <= _SPACING:
             yield (
                 f"{data} has {figures.spacing:.3g} particles to a cell and axis, {factor:.3g} times what {model} has"
                 f" seen ({seen.spacings[0]:.3g} to {seen.spacings[1]:.3g})."
             )
-        excess = seen.speed_excess(figures)
         if excess > 1:
             yield (
                 f"Speeds of {data} reach {figures.largest:.3g} cells/frame, {excess:.3g} times those that {model} is"

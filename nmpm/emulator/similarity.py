@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -31,13 +31,14 @@ _SHIFTS = tuple(1 + 0.002 * i for i in sorted(range(-20, 21), key=abs))
 _SPEED_COST, _STRIDE_COST, _BETWEEN_COST, _WALL_COST = 0.5, 0.01, 0.04, 0.01
 """Weights of speeds beyond the model's, of the squared logarithms of strides k and 1/k, and of misfits of walls."""
 _BLOCK_COST = 0.06
-"""Of each axis whose end lies elsewhere in the blocks of cells that the network coarsens than in its training: there a
-model of one box errs up to ten times as much, even in free fall."""
+"""Of each axis whose end lies elsewhere in the blocks of cells that the network coarsens to one than in its training:
+there a model of one box errs up to ten times as much, even in free fall."""
 _COARSE_COST = 0.3
-"""Of a box that is fewer cells across than the model's: heaps and gaps of few cells are predicted worst."""
+"""Of the squared logarithm by which a box is fewer cells across: heaps and gaps of few cells are predicted worst."""
 _SAME_UNITS = 4.0
 """Factor between the distances of particles of scenes that may be in the same unit of length."""
 _MOST_CELLS = 4_000_000
+_UNKNOWN = Motion()
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Match:
 def find_match(
     emulator: Emulator,
     scene: Scene,
-    motion: Motion | None = None,
+    motion: Motion = _UNKNOWN,
     materials: Mapping[str, str] | None = None,
     stride: Fraction | None = None,
     strict: bool = False,
@@ -76,7 +77,7 @@ def find_match(
     Args:
         emulator: The model.
         scene: The data's, in units of their own.
-        motion: How the data move, where that has been measured.
+        motion: How the data move, as far as that has been measured.
         materials: The model's material by the data's name; those left out are told by their names.
         stride: Frames of the data for one of the model, k or 1/k; the best of `STRIDES` if left out.
         strict: Whether to refuse what could not be matched.
@@ -90,25 +91,27 @@ def find_match(
         raise ConfigError(f"{names[0]} has {emulator.scene.dim} axes, {names[1]} {scene.dim}: no model for these data.")
     if stride is not None and (stride <= 0 or 1 not in (stride.numerator, stride.denominator)):
         raise ConfigError(f"stride = {stride}: give k or 1/k frames of the data for one of the model, k whole.")
-    measured = not scene.gravity_known and motion is not None and motion.gravity is not None
-    if measured and motion is not None:
-        scene = dataclasses.replace(scene, gravity=motion.gravity)
+    measured = not scene.gravity_known and motion.gravity is not None
+    scene = dataclasses.replace(scene, gravity=motion.gravity) if measured else scene
     mapping = match_materials(emulator.scene.materials, scene.materials, materials or {}, names)
     search = _Search(emulator, _with_channels_of(emulator.scene, scene), motion, Experience.of(emulator))
-    same = search.same_data() or search.same_units()
-    strides = search.strides if stride is None else (stride,)
-    recipe, step = same if same and stride in (None, same[1]) else search.best(strides, names)
+    kept = search.same_data() or search.same_units()
+    recipe, step = kept if kept and stride in (None, kept[1]) else search.best(stride, names)
     figures = Figures.of(scene, motion, recipe.grid.spacing, step)
     report = MatchReport(emulator.recipe, recipe, scene, step, search.seen, figures, measured, names)
     warnings = tuple(report.warnings())
     if strict and warnings:
         raise ConfigError(f"{' '.join(warnings)} Without strict these are warnings.")
-    differing = {name: to for name, to in mapping.names.items() if to != name}
-    reading = Reading(recipe.scene, differing, step.numerator, step.denominator)
-    bodies = "; obstacles -> solid channel" if scene.obstacles else ""
-    pulls = [gravity_in_cells(of.scene.gravity, of.scene.dt, of.grid.spacing) for of in (recipe, emulator.recipe)]
-    factor = pulls[0] / pulls[1] if pulls[0] and pulls[1] else None
-    return Match(recipe, reading, (*report.lines(), f"materials  {mapping}{bodies}"), warnings, factor)
+    renamed = {name: to for name, to in mapping.names.items() if to != name}
+    lines = (*report.lines(), f"materials  {mapping}{'; obstacles -> solid channel' * scene.obstacles}")
+    reading = Reading(recipe.scene, renamed, step.numerator, step.denominator)
+    return Match(recipe, reading, lines, warnings, _gravity_ratio(recipe, emulator.recipe))
+
+
+def _gravity_ratio(recipe: EmulatorRecipe, model: EmulatorRecipe) -> float | None:
+    """A recipe's gravity in cells per frame² over the model's; None where one has none, or several."""
+    data, own = (gravity_in_cells(of.scene.gravity, of.scene.dt, of.grid.spacing) for of in (recipe, model))
+    return data / own if data and own else None
 
 
 def _with_channels_of(model: Scene, scene: Scene) -> Scene:
@@ -137,31 +140,19 @@ class _Search:
 
     emulator: Emulator
     scene: Scene
-    motion: Motion | None
+    motion: Motion
     seen: Experience
-
-    @property
-    def strides(self) -> tuple[Fraction, ...]:
-        """Those of `STRIDES` with which trajectories are long enough for a start and a bundle of the model's frames."""
-        frames = self.motion.frames if self.motion else None
-        most = max(1, (frames - 1) // (self.emulator.frames + 1)) if frames else max(STRIDES)
-        return tuple(stride for stride in STRIDES if stride <= most)
 
     def same_data(self) -> tuple[EmulatorRecipe, Fraction] | None:
         """The model's form and stride for recordings such as it was fine-tuned on; None for others."""
         mine, theirs = self.emulator.scene, self.scene
         stride = Fraction(mine.dt / theirs.dt).limit_denominator(max(_WHOLE))
-        same = (mine.bounds, mine.gravity, mine.particle_volume) == (
-            theirs.bounds,
-            theirs.gravity,
-            theirs.particle_volume,
-        )
-        whole = 1 in (stride.numerator, stride.denominator) and math.isclose(float(stride) * theirs.dt, mine.dt)
-        if self.motion is None or not (same and whole and mine.boundary == theirs.boundary):
+        whole = 1 in stride.as_integer_ratio() and math.isclose(float(stride) * theirs.dt, mine.dt)
+        others = not {"domain", "dt", "obstacles"}.issuperset(mine.differences(theirs))
+        if self.motion.rms is None or others or not whole:
             return None
-        scene = dataclasses.replace(
-            theirs, domain=mine.domain, dt=mine.dt, obstacles=theirs.obstacles or mine.obstacles
-        )
+        obstacles = theirs.obstacles or mine.obstacles
+        scene = dataclasses.replace(theirs, domain=mine.domain, dt=mine.dt, obstacles=obstacles)
         return dataclasses.replace(self.emulator.recipe, scene=scene), stride
 
     def same_units(self) -> tuple[EmulatorRecipe, Fraction] | None:
@@ -173,28 +164,24 @@ class _Search:
             recipe = self.emulator.recipe.over(self.scene)
         except ConfigError:
             return None
-        figures = Figures.of(self.scene, self.motion, recipe.grid.spacing, Fraction(1))
-        (fewest, most), seen = self.seen.spacings, math.isclose(self.seen.motion_factor(figures), 1.0)
-        known = not recipe.scene.gravity_varies or (seen and fewest <= figures.spacing <= most)
-        return (recipe, Fraction(1)) if known else None
+        figures = self._figures(recipe.grid.spacing, Fraction(1))
+        (fewest, most), told = self.seen.spacings, recipe.scene.gravity_varies
+        fits = fewest <= figures.spacing <= most and math.isclose(self.seen.motion_factor(figures), 1.0)
+        return (recipe, Fraction(1)) if fits or not told else None
 
-    def best(self, strides: Sequence[Fraction], names: tuple[str, str]) -> tuple[EmulatorRecipe, Fraction]:
-        """The form of the model, and the stride, of the least cost.
+    def best(self, stride: Fraction | None, names: tuple[str, str]) -> tuple[EmulatorRecipe, Fraction]:
+        """The form of the model of the least cost, with this stride or the best.
 
         Raises:
             ConfigError: if it would have too many cells.
         """
         recipe = self.emulator.recipe
-        pairs = [
-            (stride, scale)
-            for stride in strides
-            for scale in (
-                *(self._scale(stride) * shift for shift in _SHIFTS),
-                *aligned_scales(recipe, self.scene, self._scale(stride), self.emulator.processor.alignment),
-            )
-        ]
-        choices = [(stride, similar_grid(recipe, self.scene, scale)) for stride, scale in pairs]
-        stride, grid = min(choices, key=lambda choice: self._cost(*choice))
+        grids = (
+            (each, similar_grid(recipe, self.scene, scale))
+            for each in ([stride] if stride else self._strides())
+            for scale in self._scales(each)
+        )
+        stride, grid = min(grids, key=lambda choice: self._cost(*choice))
         if math.prod(grid.cells) > _MOST_CELLS:
             raise ConfigError(
                 f"{names[1]} would need {' x '.join(map(str, grid.cells))} cells of {mean_width(grid.widths):.3g}"
@@ -203,46 +190,46 @@ class _Search:
             )
         return self._recipe(grid, stride), stride
 
-    def _scale(self, stride: Fraction) -> float:
-        """Length of the data for one of the model: of the least cost, if cells had no walls to fit.
+    def _strides(self) -> Iterator[Fraction]:
+        """Those of `STRIDES` with which trajectories are long enough for a start and a bundle of the model's frames."""
+        frames = self.motion.frames
+        most = max(1, (frames - 1) // (self.emulator.frames + 1)) if frames else max(STRIDES)
+        return (stride for stride in STRIDES if stride <= most)
+
+    def _scales(self, stride: Fraction) -> Iterator[float]:
+        """Lengths of the data for one of the model, about that of the least cost if cells had no walls to fit.
 
         At the model's spacing of particles, gravity or speeds are a factor too large. Where cells are wider by x, they
         are a factor / x: log²(factor / x) + w log² x is least at x = factor ** (1 / (1 + w)).
         """
-        at_one = Figures.of(self.scene, self.motion, self.emulator.grid.spacing, stride)
+        emulator = self.emulator
+        at_one = self._figures(emulator.grid.spacing, stride)
         usual = at_one.scaled(self.seen.spacing / at_one.spacing)
         wider = self.seen.motion_factor(usual) ** (1 / (1 + self.seen.spacing_weight))
-        return clamp(usual.spacing * wider, *self.seen.spacings) / at_one.spacing
+        scale = clamp(usual.spacing * wider, *self.seen.spacings) / at_one.spacing
+        yield from (scale * shift for shift in _SHIFTS)
+        yield from aligned_scales(emulator.recipe, self.scene, scale, emulator.processor.alignment)
 
     def _cost(self, stride: Fraction, grid: SimilarGrid) -> float:
-        figures = Figures.of(self.scene, self.motion, grid.widths, stride)
-        return (
-            _deviation(self.seen.motion_factor(figures))
-            + self.seen.spacing_weight * _deviation(figures.spacing / self.seen.spacing)
-            + _SPEED_COST * _deviation(max(1.0, self.seen.speed_excess(figures)))
+        figures, seen = self._figures(grid.widths, stride), self.seen
+        cost = (
+            _deviation(seen.motion_factor(figures))
+            + seen.spacing_weight * _deviation(figures.spacing / seen.spacing)
+            + _SPEED_COST * _deviation(max(1.0, seen.speed_excess(figures)))
             + (_STRIDE_COST if stride > 1 else _BETWEEN_COST) * math.log(stride) ** 2
             + _WALL_COST * grid.misfit
-            + _BLOCK_COST * self._axes_out_of_block(grid)
-            + _COARSE_COST * self._coarseness(grid) ** 2
         )
+        return cost if seen.varied_spacing else cost + self._shape_cost(grid.cells)
 
-    def _axes_out_of_block(self, grid: SimilarGrid) -> int:
-        """Axes whose cells are another part of a block, of those that the network coarsens to one, than the model's.
-
-        None count for a model of grids of varied sizes.
-        """
-        if self.seen.varied_spacing:
-            return 0
+    def _shape_cost(self, cells: Sequence[int]) -> float:
+        """What a model of one box pays for another shape: other blocks at the ends of axes, and fewer cells across."""
         block, usual = self.emulator.processor.alignment, self.emulator.grid.shape
-        return sum(n % block != m % block for n, m in zip(grid.cells, usual, strict=True))
+        out_of_block = sum(n % block != m % block for n, m in zip(cells, usual, strict=True))
+        coarser = math.log(max(1.0, math.prod(usual) / math.prod(cells))) / len(cells)
+        return _BLOCK_COST * out_of_block + _COARSE_COST * coarser**2
 
-    def _coarseness(self, grid: SimilarGrid) -> float:
-        """Logarithm of the model's cells across its box over those across this one; 0 if these are more.
-
-        It is 0 for a model of grids of varied sizes.
-        """
-        fewer = math.prod(self.emulator.grid.shape) / math.prod(grid.cells)
-        return 0.0 if self.seen.varied_spacing else math.log(max(1.0, fewer)) / len(grid.cells)
+    def _figures(self, widths: Sequence[float], stride: Fraction) -> Figures:
+        return Figures.of(self.scene, self.motion, widths, stride)
 
     def _recipe(self, grid: SimilarGrid, stride: Fraction) -> EmulatorRecipe:
         """The model's form on a grid over the data, without a limit on energy that would not hold there."""

@@ -12,7 +12,7 @@ from nmpm.data.loading.sources import FolderSource
 from nmpm.data.motion import measure_motion
 from nmpm.emulator.similarity import Match, find_match
 from nmpm.errors import ConfigError
-from nmpm.scene import Scene
+from nmpm.scene import Motion, Scene
 
 if TYPE_CHECKING:
     from nmpm.data.datamodule import TrajectoryDataModule
@@ -29,13 +29,13 @@ def match_data(
     """The match of a model with data; arguments and errors as those of `Pretrained.fit_to`."""
     step, names = None if stride is None else read_stride(stride), (model.name, "the data")
     if isinstance(data, Scene):
-        return find_match(model.emulator, data, None, materials, step, strict, names)
+        return find_match(model.emulator, data, Motion(), materials, step, strict, names)
     if isinstance(data, str | Path):
         data = load_trajectories(data)
     source = data.source if isinstance(data, Dataset) else data.data_source
     names = model.name, source.description
     is_recorded = isinstance(source, FolderSource)  # simulated data state what is needed
-    motion = measure_motion(source.folder, source.metadata) if is_recorded else None
+    motion = measure_motion(source.folder, source.metadata) if is_recorded else Motion()
     return find_match(model.emulator, source.scene, motion, materials, step, strict, names)
 
 

@@ -59,6 +59,8 @@ def test_a_fine_tuned_model_takes_its_data_as_in_its_training(frames):
     again = find_match(tuned, scene, motion)
     assert again.recipe == tuned.recipe
     assert Fraction(again.reading.every, again.reading.between) == frames
+    estimated = dataclasses.replace(scene, particle_volume=1.03 * scene.particle_volume)
+    assert find_match(tuned, estimated, motion).recipe.scene.domain == tuned.scene.domain
 
 
 def test_a_model_that_is_told_gravity_keeps_its_cells_where_it_knows_the_gravity():
@@ -149,11 +151,11 @@ def test_a_rougher_match_is_a_warning_with_its_factor_and_strictly_refused():
 @pytest.mark.parametrize(
     ("change", "motion", "warning"),
     [
-        ({"gravity": None}, None, "Gravity of the data is not known"),
-        ({"gravity": (0.0, 0.0)}, None, "has no gravity, but the model learnt to fall"),
-        ({"gravity": None, "gravity_varies": True}, None, "Gravity differs between the scenes"),
-        ({"gravity": (0.0, 9.81 * 250 / 1600)}, None, "points along"),
-        ({"obstacles": True, "moving_obstacles": True}, None, "moving obstacles"),
+        ({"gravity": None}, Motion(), "Gravity of the data is not known"),
+        ({"gravity": (0.0, 0.0)}, Motion(), "has no gravity, but the model learnt to fall"),
+        ({"gravity": None, "gravity_varies": True}, Motion(), "Gravity differs between the scenes"),
+        ({"gravity": (0.0, 9.81 * 250 / 1600)}, Motion(), "points along"),
+        ({"obstacles": True, "moving_obstacles": True}, Motion(), "moving obstacles"),
         ({}, Motion(1.0, 100.0), "times those that the model is calibrated for"),
     ],
     ids=["unknown", "none", "differing", "upwards", "moving", "fast"],

@@ -75,9 +75,9 @@ class Scenes:
         return sorted({round(share * last) for share in SHOWN})
 
     @cached_property
-    def motion(self) -> Motion | None:
-        """How the particles of the dataset move; None where that is not known."""
-        return None if self.source is None else measure_motion(self.source.folder, self.source.metadata)
+    def motion(self) -> Motion:
+        """How the particles of the dataset move; unknown of scenes that are no dataset's."""
+        return Motion() if self.source is None else measure_motion(self.source.folder, self.source.metadata)
 
     @cached_property
     def digests(self) -> tuple[str, ...]:
