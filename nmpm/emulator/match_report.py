@@ -96,7 +96,10 @@ class MatchReport:
             return
         varies, mine, theirs = self.model.scene.gravity_varies, self.model.scene, self.scene
         if not theirs.gravity_known and mine.gravity_known:
-            yield f"Gravity of {data} is not known, that of {model} is: state it (gravity=…)."
+            yield (
+                f"Gravity of {data} is not known, that of {model} is: state it, even if there is none, by --gravity"
+                " (fit: --data.gravity; in Python: gravity=…)."
+            )
         elif theirs.gravity_varies and not varies:
             yield f"Gravity differs between the scenes of {data}; {model} has seen one."
         elif seen.gravity and not varies and not figures.gravity:

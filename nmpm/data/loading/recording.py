@@ -269,7 +269,7 @@ class SplitRecordings(Sequence[Recording]):
         if max(frames) < least:
             raise DataError(
                 f"{self.split.path}: its longest trajectory has {max(frames)} frames, {purpose} needs {least}. Shorten"
-                " the horizon (frames per bundle x bundles unrolled), or record more frames."
+                " the horizon, frames per bundle x bundles unrolled (--model.unroll), or record more frames."
             )
         enough = [index for index, count in zip(self.indices, frames, strict=True) if count >= least]
         warnings.warn(

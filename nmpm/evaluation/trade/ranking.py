@@ -208,10 +208,10 @@ def recommend(points: Sequence[Point]) -> list[Recommendation]:
 
 
 def beside_simulator(points: Sequence[Point]) -> str:
-    """The most accurate emulator beside the simulator's stable settings, in a sentence; empty without emulators."""
+    """The most accurate emulator beside the simulator's stable settings, in a sentence; empty without either."""
     timed = [point for point in points if point.competes and math.isfinite(point.mean("mse"))]
     models = [point for point in timed if point.kind is Kind.MODEL and point.batch == 1]
-    if not models:
+    if not models or all(point.kind is not Kind.SIMULATOR for point in points):
         return ""
     model = min(models, key=lambda model: model.mean("mse"))
     time, error = model.milliseconds, model.mean("mse")

@@ -73,4 +73,5 @@ def test_the_simulator_at_equal_time_and_at_equal_error():
     assert "simulator, 6 substeps is no less accurate and takes 2 × its time" in sentence
     slower = beside_simulator([one for one in POINTS if one.name != "ours"])
     assert "simulator, 6 substeps is no slower and has 0.5 × its error" in slower
+    assert beside_simulator([one for one in POINTS if one.kind is not Kind.SIMULATOR]) == ""
     assert beside_simulator([]) == ""
