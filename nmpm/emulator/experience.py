@@ -77,9 +77,14 @@ class Experience:
         scene, stated = emulator.scene, emulator.recipe.particles_per_cell
         spacing = mean_width(emulator.grid.spacing) / scene.particle_spacing
         few, most = (n ** (1 / scene.dim) for n in stated) if stated else (spacing / _SPACING, spacing * _SPACING)
-        spacings = min(few, spacing), max(most, spacing)
-        speeds = _rms_speed(emulator), _fastest(emulator)
-        return cls(_gravities(emulator), *speeds, spacing, spacings, varied_spacing=stated is not None)
+        return cls(
+            gravity=_gravities(emulator),
+            rms=_rms_speed(emulator),
+            fastest=_fastest(emulator),
+            spacing=spacing,
+            spacings=(min(few, spacing), max(most, spacing)),
+            varied_spacing=stated is not None,
+        )
 
     @property
     def spacing_weight(self) -> float:
@@ -137,13 +142,14 @@ def _rms_speed(emulator: Emulator) -> float | None:
 
 def _fastest(emulator: Emulator) -> float | None:
     """The largest component of a velocity that is not clipped."""
-    limits = [
-        channel_values(emulator, limit, f"{name}.velocity_").abs()
+    ends = [
+        channel_values(emulator, end, f"{name}.velocity_").abs()
         for name in emulator.scene.materials
-        for limit in (emulator.input_low, emulator.input_high)
+        for end in (emulator.input_low, emulator.input_high)
     ]
-    limit = torch.cat(limits)
-    return float(limit[limit < UNLIMITED / 2].amax()) if bool((limit < UNLIMITED / 2).any()) else None
+    limits = torch.cat(ends)
+    limits = limits[limits < UNLIMITED / 2]
+    return float(limits.amax()) if len(limits) else None
 
 
 def _mean_square(emulator: Emulator, prefix: str) -> float:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Mapping, Sequence
 from types import MappingProxyType
 
 from nmpm._support.messages import suggestion
@@ -19,26 +18,9 @@ _WORDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 """Parts of other programs' names for the materials of the zoo."""
 
 
-@dataclass(frozen=True)
-class MaterialNames:
-    """The model's material by the data's name, and why.
-
-    Args:
-        names: For every material of the data.
-        note: How they were told, where the names are not the same.
-    """
-
-    names: Mapping[str, str]
-    note: str = ""
-
-    def __str__(self) -> str:
-        groups = {theirs: [name for name, to in self.names.items() if to == theirs] for theirs in self.names.values()}
-        return "; ".join(f"{', '.join(names)} -> {theirs}" for theirs, names in groups.items()) + self.note
-
-
 def match_materials(
     model: Sequence[str], data: Sequence[str], given: Mapping[str, str], sides: tuple[str, str]
-) -> MaterialNames:
+) -> dict[str, str]:
     """The model's material for each of the data.
 
     Those that are not given are told by the same name, then by a part of it or a word for it; a model of one material
@@ -53,43 +35,44 @@ def match_materials(
     Raises:
         ConfigError: if a given name is on neither side, or a material of the data cannot be told.
     """
-    _check_given(model, data, given, sides)
-    names = {name: given.get(name) or _told(name, model) for name in data}
-    if len(model) == 1:
-        guesses = [name for name in data if names[name] is None]
-        names.update(dict.fromkeys(guesses, model[0]))
-    unknown = [name for name in data if names[name] is None]
+    _check_given(given, sides[1], data)
+    _check_given(given.values(), sides[0], model)
+    only = model[0] if len(model) == 1 else None
+    names = {name: given.get(name) or _told(name, model) or only for name in data}
+    unknown = [name for name, to in names.items() if to is None]
     if unknown:
         raise ConfigError(
             f"{sides[1]} has {', '.join(data)}; {sides[0]} has {', '.join(model)}. State which is which: --materials"
-            f" {','.join(f'{name}={names[name] or model[0]}' for name in data)} (in Python materials={{"
+            f" {','.join(f'{name}={to or model[0]}' for name, to in names.items())} (in Python materials={{"
             f"{unknown[0]!r}: {model[0]!r}, …}})."
         )
-    resolved = {name: str(to) for name, to in names.items()}
-    proposed = [name for name, to in resolved.items() if name not in given and name.casefold() != to.casefold()]
-    only = f" (the only material of {sides[0]})" if len(model) == 1 else " (proposed from the names)"
-    return MaterialNames(resolved, only if proposed else "")
+    return {name: str(to) for name, to in names.items()}
 
 
-def _check_given(model: Sequence[str], data: Sequence[str], given: Mapping[str, str], sides: tuple[str, str]) -> None:
-    for names, side, others in ((given, sides[1], data), (given.values(), sides[0], model)):
-        for name in names:
-            if name not in others:
-                raise ConfigError(
-                    f"materials: {side} has no {name!r} but {', '.join(others)}.{suggestion(name, others)}"
-                    " Give the data's name first: --materials big=sand."
-                )
+def describe_materials(names: Mapping[str, str], model: Sequence[str], given: Container[str], side: str) -> str:
+    """What `match_materials` gives in words, such as "big, small -> sand (proposed from the names)"."""
+    groups = {theirs: [name for name, to in names.items() if to == theirs] for theirs in names.values()}
+    text = "; ".join(f"{', '.join(of_data)} -> {theirs}" for theirs, of_data in groups.items())
+    if all(name in given or name.casefold() == to.casefold() for name, to in names.items()):
+        return text
+    return f"{text} (the only material of {side})" if len(model) == 1 else f"{text} (proposed from the names)"
+
+
+def _check_given(given: Iterable[str], side: str, names: Sequence[str]) -> None:
+    for name in given:
+        if name not in names:
+            raise ConfigError(
+                f"materials: {side} has no {name!r} but {', '.join(names)}.{suggestion(name, names)}"
+                " Give the data's name first: --materials big=sand."
+            )
 
 
 def _told(name: str, model: Sequence[str]) -> str | None:
     """The model's material that a name means; None if that cannot be told, or could be two."""
     if name in model:
         return name
-    plain = name.casefold()
-    same = [theirs for theirs in model if theirs.casefold() == plain]
-    near = [
-        theirs
-        for theirs in model
-        if any(word in plain for word in (theirs.casefold(), *_WORDS.get(theirs.casefold(), ())))
-    ]
-    return next(iter(same or near), None) if len(same or near) == 1 else None
+    plain, words = name.casefold(), {theirs: theirs.casefold() for theirs in model}
+    same = [theirs for theirs, word in words.items() if word == plain]
+    near = [theirs for theirs, word in words.items() if any(part in plain for part in (word, *_WORDS.get(word, ())))]
+    candidates = same or near
+    return candidates[0] if len(candidates) == 1 else None

@@ -15,7 +15,7 @@ from fractions import Fraction
 
 from nmpm.emulator.experience import Experience, Figures, clamp, gravity_in_cells, mean_width
 from nmpm.emulator.match_report import MatchReport
-from nmpm.emulator.material_names import match_materials
+from nmpm.emulator.material_names import describe_materials, match_materials
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.recipe import EmulatorRecipe
 from nmpm.emulator.similar_grid import SimilarGrid, aligned_scales, similar_grid
@@ -93,25 +93,26 @@ def find_match(
         raise ConfigError(f"stride = {stride}: give k or 1/k frames of the data for one of the model, k whole.")
     measured = not scene.gravity_known and motion.gravity is not None
     scene = dataclasses.replace(scene, gravity=motion.gravity) if measured else scene
-    mapping = match_materials(emulator.scene.materials, scene.materials, materials or {}, names)
+    given, theirs = materials or {}, emulator.scene.materials
+    renamed = match_materials(theirs, scene.materials, given, names)
     search = _Search(emulator, _with_channels_of(emulator.scene, scene), motion, Experience.of(emulator))
-    kept = search.same_data() or search.same_units()
-    recipe, step = kept if kept and stride in (None, kept[1]) else search.best(stride, names)
+    recipe, step = search.find(stride, names)
     figures = Figures.of(scene, motion, recipe.grid.spacing, step)
     report = MatchReport(emulator.recipe, recipe, scene, step, search.seen, figures, measured, names)
     warnings = tuple(report.warnings())
     if strict and warnings:
         raise ConfigError(f"{' '.join(warnings)} Without strict these are warnings.")
-    renamed = {name: to for name, to in mapping.names.items() if to != name}
-    lines = (*report.lines(), f"materials  {mapping}{'; obstacles -> solid channel' * scene.obstacles}")
-    reading = Reading(recipe.scene, renamed, step.numerator, step.denominator)
+    told = describe_materials(renamed, theirs, given, names[0])
+    lines = (*report.lines(), f"materials  {told}{'; obstacles -> solid channel' * scene.obstacles}")
+    differing = {name: to for name, to in renamed.items() if to != name}
+    reading = Reading(recipe.scene, differing, *step.as_integer_ratio())
     return Match(recipe, reading, lines, warnings, _gravity_ratio(recipe, emulator.recipe))
 
 
 def _gravity_ratio(recipe: EmulatorRecipe, model: EmulatorRecipe) -> float | None:
     """A recipe's gravity in cells per frame² over the model's; None where one has none, or several."""
-    data, own = (gravity_in_cells(of.scene.gravity, of.scene.dt, of.grid.spacing) for of in (recipe, model))
-    return data / own if data and own else None
+    data, usual = (gravity_in_cells(of.scene.gravity, of.scene.dt, of.grid.spacing) for of in (recipe, model))
+    return data / usual if data and usual else None
 
 
 def _with_channels_of(model: Scene, scene: Scene) -> Scene:
@@ -143,41 +144,17 @@ class _Search:
     motion: Motion
     seen: Experience
 
-    def same_data(self) -> tuple[EmulatorRecipe, Fraction] | None:
-        """The model's form and stride for recordings such as it was fine-tuned on; None for others."""
-        mine, theirs = self.emulator.scene, self.scene
-        stride = Fraction(mine.dt / theirs.dt).limit_denominator(max(_WHOLE))
-        whole = 1 in stride.as_integer_ratio() and math.isclose(float(stride) * theirs.dt, mine.dt)
-        others = not {"domain", "dt", "obstacles"}.issuperset(mine.differences(theirs))
-        if self.motion.rms is None or others or not whole:
-            return None
-        obstacles = theirs.obstacles or mine.obstacles
-        scene = dataclasses.replace(theirs, domain=mine.domain, dt=mine.dt, obstacles=obstacles)
-        return dataclasses.replace(self.emulator.recipe, scene=scene), stride
-
-    def same_units(self) -> tuple[EmulatorRecipe, Fraction] | None:
-        """The model's cells for a scene in its units, with its time step and gravity that it knows; None for others."""
-        apart = self.scene.particle_spacing / self.emulator.scene.particle_spacing
-        if not 1 / _SAME_UNITS < apart < _SAME_UNITS:
-            return None
-        try:
-            recipe = self.emulator.recipe.over(self.scene)
-        except ConfigError:
-            return None
-        figures = self._figures(recipe.grid.spacing, Fraction(1))
-        (fewest, most), told = self.seen.spacings, recipe.scene.gravity_varies
-        fits = fewest <= figures.spacing <= most and math.isclose(self.seen.motion_factor(figures), 1.0)
-        return (recipe, Fraction(1)) if fits or not told else None
-
-    def best(self, stride: Fraction | None, names: tuple[str, str]) -> tuple[EmulatorRecipe, Fraction]:
-        """The form of the model of the least cost, with this stride or the best.
+    def find(self, stride: Fraction | None, names: tuple[str, str]) -> tuple[EmulatorRecipe, Fraction]:
+        """The form of the model and the stride, this one or the best; the model's own cells where they fit as they are.
 
         Raises:
-            ConfigError: if it would have too many cells.
+            ConfigError: if there would be too many cells.
         """
-        recipe = self.emulator.recipe
+        kept = self._same_data() or self._same_units()
+        if kept and stride in (None, kept[1]):
+            return kept
         grids = (
-            (each, similar_grid(recipe, self.scene, scale))
+            (each, similar_grid(self.emulator.recipe, self.scene, scale))
             for each in ([stride] if stride else self._strides())
             for scale in self._scales(each)
         )
@@ -189,6 +166,31 @@ class _Search:
                 f" particles that are {self.scene.particle_spacing:.3g} apart. State narrower ones (data.bounds)."
             )
         return self._recipe(grid, stride), stride
+
+    def _same_data(self) -> tuple[EmulatorRecipe, Fraction] | None:
+        """The model's form and stride for recordings such as it was fine-tuned on; None for others."""
+        mine, theirs = self.emulator.scene, self.scene
+        stride = Fraction(mine.dt / theirs.dt).limit_denominator(max(_WHOLE))
+        whole = 1 in stride.as_integer_ratio() and math.isclose(float(stride) * theirs.dt, mine.dt)
+        others = not {"domain", "dt", "obstacles"}.issuperset(mine.differences(theirs))
+        if self.motion.rms is None or others or not whole:
+            return None
+        obstacles = theirs.obstacles or mine.obstacles
+        scene = dataclasses.replace(theirs, domain=mine.domain, dt=mine.dt, obstacles=obstacles)
+        return dataclasses.replace(self.emulator.recipe, scene=scene), stride
+
+    def _same_units(self) -> tuple[EmulatorRecipe, Fraction] | None:
+        """The model's cells for a scene in its units, with its time step and gravity that it knows; None for others."""
+        apart = self.scene.particle_spacing / self.emulator.scene.particle_spacing
+        if not 1 / _SAME_UNITS < apart < _SAME_UNITS:
+            return None
+        try:
+            recipe = self.emulator.recipe.over(self.scene)
+        except ConfigError:
+            return None
+        figures, (fewest, most) = self._figures(recipe.grid.spacing, Fraction(1)), self.seen.spacings
+        fits = fewest <= figures.spacing <= most and math.isclose(self.seen.motion_factor(figures), 1.0)
+        return (recipe, Fraction(1)) if fits or not recipe.scene.gravity_varies else None
 
     def _strides(self) -> Iterator[Fraction]:
         """Those of `STRIDES` with which trajectories are long enough for a start and a bundle of the model's frames."""
