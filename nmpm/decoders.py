@@ -46,7 +46,7 @@ class _Ballistic(Decoder):
     """Decoders that keep the bundle's initial velocity, accelerated by known gravity."""
 
     def known_velocity(self, carried: Tensor, previous: Tensor, gravity: Tensor, frame: int) -> Tensor:  # noqa: ARG002
-        return carried + gravity * frame
+        return torch.add(carried, gravity, alpha=frame)
 
 
 @dataclass(frozen=True)

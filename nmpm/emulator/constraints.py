@@ -26,15 +26,13 @@ MOST_GAIN = 0.01
 FREE_FALL_SHARE = 0.8
 """A particle falls freely if it is accelerated by at least this share of gravity."""
 
-_UNLIMITED = 1e18  # energy: stands for an infinite budget, whose gradient would be NaN
-
 BoundsRule = Callable[[Tensor, Tensor, Tensor], Tensor]
 """From positions and the bounds' lower and upper ends, which broadcast, to positions."""
 
 
 def stop(cells: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Stop positions beyond the bounds there."""
-    return torch.maximum(torch.minimum(cells, high), low)
+    return torch.clamp(cells, low, high)
 
 
 def reflect(cells: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -127,8 +125,7 @@ def mass_shares(scene: Scene, material: Tensor, volume: Tensor, dtype: torch.dty
     if len(set(scene.densities)) > 1:
         for index, density in enumerate(scene.densities):
             mass = torch.where(material == index, mass * (density / max(scene.densities)), mass)
-    total = mass.sum(-1, keepdim=True)
-    return (mass / torch.where(total > 0, total, 1.0)).unsqueeze(-1)
+    return (mass / mass.sum(-1, keepdim=True).clamp(min=torch.finfo(dtype).tiny)).unsqueeze(-1)
 
 
 def lowest_potential(scene: Scene, gravity: Tensor) -> Tensor:
@@ -138,66 +135,6 @@ def lowest_potential(scene: Scene, gravity: Tensor) -> Tensor:
     """
     sides = zip(gravity.unbind(-1), scene.bounds, strict=True)
     return -torch.stack([torch.maximum(along * low, along * high) for along, (low, high) in sides]).sum(0)
-
-
-def affordable(cells: Tensor, step: Tensor, before: Tensor, gravity: Tensor, share: Tensor, budget: Tensor) -> Tensor:
-    """(B, N, 1) factors for the particles' steps in a frame with which their scene does not exceed its energy.
-
-    With a factor s for some of the steps the energy after the frame is a parabola in s; the largest s in [0, 1] within
-    the budget is taken. In a scene that exceeds its budget s applies to the particles that gain energy in this frame;
-    if that cannot suffice, to all. In other scenes all factors are exactly 1.
-
-    Of positions before the frame, proposed steps and steps of the frame before (B, N, D), gravity (B, 1, D), shares of
-    the scene's mass (B, N, 1) and the energy (B,) that is allowed.
-    """
-    mass = share.squeeze(-1)
-    work = step * gravity
-    kinetic = _over_axes(step.square()) / 2 * mass
-    fall = -_over_axes(work) * mass
-    excess = (-_over_axes(cells * gravity) * mass).sum(1) - budget  # of the scene if nobody moved
-    excess = excess.clamp(min=-_UNLIMITED)
-    # Beyond the rounding of positions that steps come from, and without the large terms that cancel:
-    # v'² - v² = (v' - v)(v' + v). In free fall, v' = v + g, a frame takes g² / 2.
-    rounding = 4 * torch.finfo(step.dtype).eps * (cells * step).abs()
-    gains = _over_axes((step - before) * (step + before) / 2 - work - rounding) > 0
-    gaining = gains.to(step.dtype)
-    square = torch.stack([(kinetic * gaining).sum(1), kinetic.sum(1)], dim=1)  # of those that gain; of all
-    slope = torch.stack([(fall * gaining).sum(1), fall.sum(1)], dim=1)
-    both = square + slope
-    constant = excess.unsqueeze(1) + (both[:, 1:] - both)
-    factor, exact = _largest_root(square, slope, constant)
-    suffices = exact[:, 0] & (factor[:, 0] >= 0) & (factor[:, 0] <= 1)
-    taken = torch.where(suffices, factor[:, 0], factor[:, 1].clamp(0, 1))
-    exceeds = both[:, 1] + excess > 0
-    applies = exceeds.unsqueeze(1) & (gains | ~suffices.unsqueeze(1))
-    return torch.where(applies, taken.unsqueeze(1), 1.0).unsqueeze(-1)
-
-
-def affordable_share(before: Tensor, after: Tensor, budget: Tensor) -> Tensor:
-    """(B,) the part of the way between two paths that each scene can afford, as energy is convex in it.
-
-    From energies (B, F) of both paths' frames and the allowed energy (B,); exactly 1 where the end is within it.
-    """
-    exceeds = after > budget.unsqueeze(1)
-    rise = torch.where(exceeds, after - before, 1.0)
-    room = (budget.unsqueeze(1) - before).clamp(min=0)
-    possible = torch.where(rise > 0, room / torch.where(rise > 0, rise, 1.0), 0.0)
-    return torch.where(exceeds, possible, 1.0).amin(1)
-
-
-def _over_axes(values: Tensor) -> Tensor:
-    """(...) sum of (..., D) over D: ten times as fast on a CPU as torch's sum over so short an axis."""
-    first, *others = values.unbind(-1)
-    return sum(others, start=first)
-
-
-def _largest_root(square: Tensor, slope: Tensor, constant: Tensor) -> tuple[Tensor, Tensor]:
-    """Largest s with square · s² + slope · s + constant = 0, and whether there is one; else where that is lowest."""
-    tiny = torch.finfo(square.dtype).tiny
-    inner = slope.square() - 4 * square * constant
-    moves = square > tiny**0.5  # so that neither the quotient nor its gradient overflows
-    root = (inner.clamp(min=tiny).sqrt() - slope) / torch.where(moves, 2 * square, 1.0)
-    return root, moves & (inner >= 0)
 
 
 def at_rest(start: Tensor, path: Tensor, speed: float, gravity: Tensor) -> Tensor:

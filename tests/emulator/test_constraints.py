@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from nmpm.decoders import Absolute, Flip
 from nmpm.emulator.bundle import RolloutContext
-from nmpm.emulator.constraints import affordable, affordable_share, at_rest, energy, mass_shares
+from nmpm.emulator.constraints import at_rest, energy, mass_shares
+from nmpm.emulator.engines.torch.energy import EnergyLimit, affordable_share
 from nmpm.emulator.rollouts import differentiable_rollout, rollout, unroll
 from nmpm.errors import ConfigError
 from nmpm.transfer import without_kernels
@@ -41,7 +42,8 @@ def test_steps_stay_within_the_budget_and_are_left_alone_below_it(seed, fall, al
     share = torch.rand(1, 7, 1, generator=generator, dtype=torch.float64)
     gravity, share = torch.tensor([[[0.3 * fall, fall]]], dtype=torch.float64), share / share.sum()
     budget = energy(cells, torch.zeros_like(cells), gravity, share) + allowed
-    held = step * affordable(cells, step, before, gravity, share, budget)
+    excess = EnergyLimit(gravity, share, budget).excess(cells, step, before)
+    held = step if excess is None else step * (1 - excess)
     after = energy(cells + held, held, gravity, share)
     assert (after <= budget + 1e-9).all()
     if (energy(cells + step, step, gravity, share) <= budget).all():
@@ -87,7 +89,7 @@ def test_the_energy_of_no_frame_exceeds_that_of_the_first_state(branching, cap, 
 def without_branches(monkeypatch):
     """As on a GPU: nothing is decided by reading values back, and no kernel of the CPU runs."""
     monkeypatch.setattr("nmpm.emulator.engines.rules.kernels_are_on", lambda: False)
-    for module in ("advection", "contact", "crowding"):
+    for module in ("energy", "contact", "crowding"):
         monkeypatch.setattr(f"nmpm.emulator.engines.torch.{module}.is_eager_cpu", lambda values: False)
 
 

@@ -63,7 +63,7 @@ def _find_flow(
 def _affordable_share(
     start: StartArrays, path: Array, spread: Array, parameters: KernelParameters, budget: float, threads: int
 ) -> float:
-    """The part of the way to the spread path that no frame's energy forbids, see `constraints.affordable_share`."""
+    """The part of the way to the spread path that no frame's energy forbids, see the torch engine's `energy`."""
     mass = np.empty(len(start.cells), np.float32)
     fill_mass(start.material, start.mask, parameters.mass, mass)
 

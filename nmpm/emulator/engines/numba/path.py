@@ -67,7 +67,7 @@ def find_path(
 def _affordable(sums: list[float], budget: float) -> tuple[float, bool]:
     """The factor for steps that keeps the energy, and whether it is for those alone that gain energy.
 
-    As `nmpm.emulator.constraints.affordable`, from the sums of `propose_frame`.
+    As the torch engine's `energy`, from the sums of `propose_frame`.
     """
     height, kinetic_gained, kinetic, fall_gained, fall = sums
     excess = max(height - budget, -1e18)

@@ -101,7 +101,7 @@ class Rasterise(torch.autograd.Function):
 
 
 class FreePath(torch.autograd.Function):
-    """`Advection.free_path` with gradients with respect to positions, velocities, grid state and network output."""
+    """The free path with gradients with respect to positions, velocities, grid state and network output."""
 
     @staticmethod
     def forward(ctx: Any, parameters: KernelParameters, *tensors: Tensor) -> Tensor:

@@ -58,15 +58,18 @@ class TorchEngine(Engine[BundleStart, Tensor]):
         """(B, m, N, D) positions in cells by an output (B, m, materials * D, *S), which obey the constraints."""
         fields, advection = self.velocities(output), Advection(self.emulator)
         if self.emulator.training:
-            return advection.free_path(start, fields)
-        return advection.constrained_path(start, fields, context.solid, context.budget)
+            path = advection.free_path(start, fields)
+        else:
+            path = advection.constrained_path(start, fields, context.solid, context.budget)
+        advection.check_bounds(start, path)
+        return path
 
     def velocities(self, output: Tensor) -> Tensor:
         """(B, m, materials * D, *S) in cells per frame."""
         return output.to(self.emulator.precision) * self.emulator.output_scale[:, : output.shape[2]]
 
     def spread(self, start: BundleStart, flight: Flight[Tensor], context: RolloutContext) -> Flight[Tensor]:
-        path = Advection(self.emulator).uncrowded_path(start, flight.path, context.solid, context.budget)
+        path = Advection(self.emulator).spread_path(start, flight.path, context.solid, context.budget)
         return dataclasses.replace(flight, path=path)
 
     def land(self, start: BundleStart, flight: Flight[Tensor]) -> Bundle:
