@@ -10,7 +10,7 @@ import pytorch_optimizer
 import torch
 from torch import Tensor
 
-from nmpm.emulator.runtimes import cuda_graph
+from nmpm.emulator.engines import graphs
 from nmpm.errors import ConfigError
 
 
@@ -118,9 +118,9 @@ class _RecordedMoves:
         changing = [values for values in kept if len(values)]
         before = [values.clone() for values in changing]
         try:
-            self._replay, _ = cuda_graph.record(self._compute, weights[0].device)
+            self._replay, _ = graphs.record(self._compute, weights[0].device)
         except Exception as failure:  # (of whatever an operation raises that cannot be recorded)
-            cuda_graph.warn_not_recorded("Steps of SOAP", failure)
+            graphs.warn_not_recorded("Steps of SOAP", failure)
             self._replay = self._compute
         torch._foreach_copy_(changing, before)  # recording has called it several times
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nmpm import optimizers
-from nmpm.emulator.runtimes import cuda_graph
+from nmpm.emulator.engines import graphs
 from nmpm.errors import ConfigError
 from nmpm.optimizers import SOAP
 
@@ -64,11 +64,11 @@ def test_recorded_steps_move_weights_as_others_do(monkeypatch, device, frequency
         replay, result = (function, None) if device.type == "cpu" else on_gpu(function, *arguments)
         return (lambda: (replays.append(1), replay())), result
 
-    on_gpu = cuda_graph.record
+    on_gpu = graphs.record
     monkeypatch.setattr(optimizers, "is_on_gpu", lambda _: False)
     plain = train(resume_at=20)
     monkeypatch.setattr(optimizers, "is_on_gpu", lambda _: True)
-    monkeypatch.setattr(cuda_graph, "record", record)
+    monkeypatch.setattr(graphs, "record", record)
     for resume_at in (20, 7):
         for one, other in zip(train(resume_at), plain, strict=True):
             exact = {"rtol": 0, "atol": 0} if device.type == "cpu" else {"rtol": 1e-4, "atol": 1e-5}
@@ -80,7 +80,7 @@ def test_steps_that_cannot_be_recorded_are_computed_with_one_warning(monkeypatch
     weight = torch.nn.Parameter(torch.ones(3, 3))
     optimizer = SOAP([weight], record=True)
     monkeypatch.setattr(optimizers, "is_on_gpu", lambda _: True)
-    monkeypatch.setattr(cuda_graph, "record", lambda *_: 1 / 0)
+    monkeypatch.setattr(graphs, "record", lambda *_: 1 / 0)
     weight.grad = torch.eye(3)
     optimizer.step()
     with pytest.warns(UserWarning, match="Steps of SOAP are not recorded as CUDA graphs: division by zero"):

@@ -76,8 +76,7 @@ def add_runtime_option(parser: argparse.ArgumentParser) -> None:
         "--runtime",
         default="eager",
         help="what computes the network: eager (torch, default), openvino (CPU, nmpm[openvino]), windows (for"
-        " large scenes that are mostly empty), cuda-graph (GPU, one scene in a fifth of the time), triton (GPU, not"
-        " tried on one yet), or auto for the fastest of eager, openvino and cuda-graph here",
+        " large scenes that are mostly empty), or auto for the faster of eager and openvino here",
     )
 
 

@@ -49,7 +49,7 @@ examples:
   nmpm rollout wbcsph --gravity 6,7.5                    thrown blocks, where a model takes any gravity
   nmpm rollout runs/goop/checkpoints/last.ckpt
   nmpm rollout goop --out splash.usda                    for Blender; .vtkhdf for ParaView, .csv, …
-  nmpm rollout goop --device cuda --runtime auto         on a GPU, by CUDA graphs
+  nmpm rollout goop --device cuda                        on a GPU, by CUDA graphs
 """
 
 

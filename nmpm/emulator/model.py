@@ -23,8 +23,10 @@ from nmpm.emulator.bundle import Bundle as Bundle
 from nmpm.emulator.bundle import RolloutContext as RolloutContext
 from nmpm.emulator.constraints import Constraints, energy, mass_shares
 from nmpm.emulator.engines import find_engine
+from nmpm.emulator.engines.graphs import RecordedCalls
 from nmpm.emulator.engines.numba.parameters import KernelParameters, kernel_parameters
 from nmpm.emulator.engines.rules import MODELS, lacks, model_engines
+from nmpm.emulator.engines.trial import KernelTrial
 from nmpm.emulator.fields import FieldScales
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
@@ -53,6 +55,8 @@ class Emulator(nn.Module):
     Attributes:
         runtime: Computes the network.
         engines: Names of the engines beside torch's that compute all that the recipe has, the fastest first.
+        recorded_calls: Records and replays calls on a CUDA GPU.
+        kernel_trial: Compares Triton's kernels with torch before they are used.
         thread_choice: Sets torch's number of threads for each call; None to leave it alone.
     """
 
@@ -70,6 +74,7 @@ class Emulator(nn.Module):
         self.recipe = recipe
         self._set_engines(recipe)
         self.runtime: Runtime = Eager()
+        self.recorded_calls, self.kernel_trial = RecordedCalls(), KernelTrial()
         self.thread_choice: ThreadChoice | None = None
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
@@ -248,9 +253,9 @@ class Emulator(nn.Module):
         """Predict the next m frames from a state; the context is that of the rollout's first state, or of this one."""
         context = self.context(particles) if context is None else context
         if self.thread_choice is None:
-            return self.runtime.bundle(self, particles, context)
+            return self.recorded_calls.predict(self, particles, context)
         self.thread_choice.start()
-        bundle = self.runtime.bundle(self, particles, context)
+        bundle = self.recorded_calls.predict(self, particles, context)
         self.thread_choice.stop()
         return bundle
 

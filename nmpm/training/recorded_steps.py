@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from nmpm._support.devices import copy_to
 from nmpm.emulator import Emulator
-from nmpm.emulator.runtimes import cuda_graph
+from nmpm.emulator.engines import graphs
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.particles import Particles, Window
@@ -78,7 +78,7 @@ class RecordedSteps:
                     self._pool = torch.cuda.graph_pool_handle()
                 self._steps[key] = _RecordedStep(error, emulator, window, inputs, self._pool)
             except Exception as failure:  # (of whatever an operation raises that cannot be recorded)
-                cuda_graph.warn_not_recorded("Training steps", failure)
+                graphs.warn_not_recorded("Training steps", failure)
                 self._failed = True
                 self._steps.clear()
         return self._steps.get(key)
@@ -108,7 +108,7 @@ class _RecordedStep:
                     return mean.detach(), torch.autograd.grad(mean, self._weights, allow_unused=True)
 
         with torch.random.fork_rng([device] if device.type == "cuda" else []):  # a first replay draws what others do
-            self._replay, (self._mean, self._gradients) = cuda_graph.record(compute, device, pool)
+            self._replay, (self._mean, self._gradients) = graphs.record(compute, device, pool)
 
     def __call__(self, inputs: Sequence[Tensor]) -> Tensor:
         torch._foreach_copy_(self._inputs, list(inputs))

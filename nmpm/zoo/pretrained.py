@@ -240,9 +240,9 @@ class Pretrained:
 
         Args:
             runtime: One of `nmpm.emulator.runtimes.RUNTIMES`, by name or made with options: "openvino" (CPU, needs
-                `nmpm[openvino]`), "windows" (large scenes that are mostly empty), "cuda-graph" or "triton" (GPU, not
-                tried on one yet), or "eager", torch itself; "auto" for the fastest of openvino, cuda-graph and eager
-                here, as measured in short rollouts.
+                `nmpm[openvino]`), "windows" (large scenes that are mostly empty), or "eager", torch itself; "auto" for
+                the faster of openvino and eager here, as measured in short rollouts. On a CUDA GPU calls by eager are
+                recorded as CUDA graphs without being asked.
             precision: As for `with_network`; the network's own if left out.
 
         Raises:

@@ -101,7 +101,6 @@ LONG = "x" * 300
         (["rollout", "goop", "--device", "cuda:77"], "has no device 'cuda:77'"),
         (["rollout", "goop", "--device", "meta"], "--device meta: it is not one of"),
         (["rollout", "goop", "--runtime", "fast"], "called 'fast'; there are auto, "),
-        (["rollout", "goop", "--runtime", "cuda-graph"], "needs a CUDA GPU; the model is on cpu."),
         (["rollout", "gop"], r"Did you mean goop\?"),
         (["rollout", "nothing.ckpt"], "nothing.ckpt: there is no such checkpoint"),
         (["simulate", "waterramp", "--out", "a"], "Did you mean waterramps"),

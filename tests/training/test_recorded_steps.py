@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.emulator.runtimes import cuda_graph
+from nmpm.emulator.engines import graphs
 from nmpm.training import EmulatorModule, module
 from nmpm.transfer import without_kernels
 from tests.trainings import TINY, module_of, train
@@ -34,8 +34,8 @@ def replays(monkeypatch, device):
         return (lambda: (counted.append(result[0].shape), replay())), result
 
     counted = []
-    recorder = cuda_graph.record if device.type == "cuda" else record
-    monkeypatch.setattr(cuda_graph, "record", counting)
+    recorder = graphs.record if device.type == "cuda" else record
+    monkeypatch.setattr(graphs, "record", counting)
     monkeypatch.setattr(module, "can_record", lambda _: True)
     monkeypatch.setattr(module, "MULTIPLE", 1)  # padding changes the order of sums, and which noise is whose
     monkeypatch.setattr(EmulatorModule, "rows", lambda _, batch: [slice(len(batch.frames))])  # as on a GPU

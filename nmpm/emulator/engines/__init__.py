@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 
 def find_engine(emulator: Emulator, particles: Particles, solid: Tensor) -> Engine[Any, Any]:
     """The engine that computes a call, of a state among solids (B, C_solid, *S)."""
-    return ENGINES[call_engine(emulator, particles, solid)](emulator)
+    name = call_engine(emulator, particles, solid)
+    if name == "triton" and not emulator.kernel_trial.passes(emulator, particles, solid):
+        name = "torch"
+    return ENGINES[name](emulator)
 
 
 def _numba(emulator: Emulator) -> Engine[Any, Any]:

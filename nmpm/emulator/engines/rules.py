@@ -5,8 +5,10 @@ The torch engine computes everything; the others are faster, and compute what th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import importlib.util
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 import torch
@@ -15,7 +17,7 @@ from torch import Tensor
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
 from nmpm.particles import Particles, scene_volumes
 from nmpm.transfer import Linear, Nearest, Quadratic
-from nmpm.transfer.execution import kernels_are_on
+from nmpm.transfer.execution import is_default, kernels_are_on
 
 if TYPE_CHECKING:
     from nmpm.emulator.model import Emulator
@@ -58,12 +60,28 @@ class Call:
         return self.emulator.precision == torch.float32 and all(each.dtype == torch.float32 for each in given)
 
     @property
+    def inputs(self) -> Iterator[Tensor]:
+        yield from (values for values in vars(self.particles).values() if isinstance(values, Tensor))
+        yield from self.particles.fields.values()
+        yield self.solid
+        yield from self.emulator.parameters()
+
+    @property
     def sizes_differ(self) -> bool:
         return scene_volumes(self.particles.volume, self.particles.mask) is None
 
 
 def _need_gradients(tensors: Iterable[Tensor]) -> bool:
     return torch.is_grad_enabled() and any(values.requires_grad for values in tensors)
+
+
+@cache
+def _has_triton() -> bool:
+    return importlib.util.find_spec("triton") is not None
+
+
+def _is_autocast(device: str) -> bool:
+    return torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
 
 
 _KNOWN_DECODERS = (Absolute, Residual, Flip, Blend, Acceleration)
@@ -90,6 +108,7 @@ MODELS: tuple[Rule[EmulatorRecipe], ...] = (
 CALLS: tuple[Rule[Call], ...] = (
     Rule("a CPU", ("numba", "numba training"), lambda call: call.device == "cpu"),
     Rule("a CUDA GPU", ("triton",), lambda call: call.device == "cuda"),
+    Rule("machines without Triton", ("numba", "numba training"), lambda _: not _has_triton()),
     Rule("other devices", (), lambda call: call.device not in ("cpu", "cuda")),
     Rule("rollouts", ("numba", "triton"), lambda call: not call.emulator.training),
     Rule("trainings", ("numba training",), lambda call: call.emulator.training),
@@ -109,6 +128,24 @@ CALLS: tuple[Rule[Call], ...] = (
         lambda _: torch.are_deterministic_algorithms_enabled(),
     ),
 )  # fmt: skip
+
+RECORDINGS: tuple[Rule[Call], ...] = (
+    Rule("devices other than a CUDA GPU", (), lambda call: call.device != "cuda"),
+    Rule("the runtimes openvino and windows", (), lambda call: not call.emulator.runtime.recordable),
+    Rule("trainings (`--model.record true` records whole steps)", (), lambda call: call.emulator.training),
+    Rule("bounds: error", (), lambda call: call.emulator.constraints.bounds == "error"),
+    Rule("gradients", (), lambda call: _need_gradients(call.inputs)),
+    Rule("autocast", (), lambda call: _is_autocast(call.device)),
+    Rule("graphs that torch.compile traces", (), lambda _: torch.compiler.is_compiling()),
+    Rule("nmpm.transfer.without_kernels and scatter_backend", (), lambda _: not is_default()),
+    Rule("a recording of something else", (), lambda _: torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()),
+)
+"""What calls that are recorded as CUDA graphs cannot have, whichever engine computes them."""
+
+
+def is_recordable(call: Call) -> bool:
+    """Whether a call can be recorded as a CUDA graph."""
+    return not any(rule.holds(call) for rule in RECORDINGS)
 
 
 def model_engines(recipe: EmulatorRecipe) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 P = TypeVar("P")
 
-_MOST = 8
+MOST = 8
 """Programs kept by one runtime: batches and grids of one use differ little."""
 
 
@@ -24,7 +24,8 @@ class _Weight:
         store, name: Where the module keeps it.
         tensor: What that was when the program was made.
         alias: Keeps the memory, so that no other tensor gets its address.
-        address, version: Of the tensor then; writing to it changes the version, replacing its memory the address.
+        address, version: Of the tensor then; writing to it changes the version, replacing its memory the address. Those
+            made in inference mode have no version.
     """
 
     store: Mapping[str, Tensor | None]
@@ -32,7 +33,7 @@ class _Weight:
     tensor: Tensor
     alias: Tensor
     address: int
-    version: int
+    version: int | None
 
 
 @dataclass(frozen=True)
@@ -47,9 +48,9 @@ class _Compiled(Generic[P]):
         """Whether the module has the same weights, unchanged: asked in each call, hence a loop without calls."""
         for weight in self.weights:
             tensor = weight.tensor
-            if weight.store.get(weight.name) is not tensor or tensor._version != weight.version:
+            if weight.store.get(weight.name) is not tensor or tensor.data_ptr() != weight.address:
                 return False
-            if tensor.data_ptr() != weight.address:
+            if weight.version is not None and tensor._version != weight.version:
                 return False
         return True
 
@@ -57,7 +58,9 @@ class _Compiled(Generic[P]):
 def _weights(network: nn.Module) -> list[_Weight]:
     stores = (store for module in network.modules() for store in (module._parameters, module._buffers))
     return [
-        _Weight(store, name, tensor, tensor.detach(), tensor.data_ptr(), tensor._version)
+        _Weight(
+            store, name, tensor, tensor.detach(), tensor.data_ptr(), None if tensor.is_inference() else tensor._version
+        )
         for store in stores
         for name, tensor in store.items()
         if tensor is not None
@@ -71,6 +74,16 @@ class Programs(Generic[P]):
         self._compiled: OrderedDict[tuple[int, Hashable], _Compiled[P]] = OrderedDict()
         self._lock = Lock()
 
+    def get(self, network: nn.Module, settings: Hashable) -> P | None:
+        """The program of a module for settings; None if there is none of its present weights."""
+        key = id(network), settings
+        with self._lock:
+            compiled = self._compiled.get(key)
+            if compiled is None or not compiled.is_current():
+                return None
+            self._compiled.move_to_end(key)
+            return compiled.program
+
     def find(self, network: nn.Module, settings: Hashable, compile_program: Callable[[], P]) -> P:
         """The program of a module for settings, all else that it depends on; compiled if there is none."""
         key = id(network), settings
@@ -79,6 +92,6 @@ class Programs(Generic[P]):
             if compiled is None or not compiled.is_current():
                 compiled = self._compiled[key] = _Compiled(network, _weights(network), compile_program())
             self._compiled.move_to_end(key)
-            while len(self._compiled) > _MOST:
+            while len(self._compiled) > MOST:
                 self._compiled.popitem(last=False)
             return compiled.program

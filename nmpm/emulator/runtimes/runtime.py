@@ -1,4 +1,4 @@
-"""The contract of runtimes, and the runtime of torch itself, which takes every network, device and precision."""
+"""The contract of runtimes, and that of torch itself, which takes every network, device and precision."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Runtime(ABC):
-    """Computes an emulator's network, or whole bundles.
+    """Computes an emulator's network.
 
     Weights stay in the emulator. An instance may keep programs compiled from them; copies and unpickled instances start
     without, so that copied emulators, on other devices or with other weights, compile their own.
@@ -31,6 +31,9 @@ class Runtime(ABC):
     """Whether another shape of the state or of the grid costs a compilation."""
     automatic: ClassVar[bool] = True
     """Whether `nmpm.zoo.optimization` tries it where the fastest is asked for."""
+
+    recordable: ClassVar[bool] = False
+    """Whether CUDA graphs can hold calls in which it computes the network."""
 
     def unsupported_reason(self, emulator: Emulator) -> str:  # noqa: ARG002 (none unless overridden)
         """Why this runtime cannot run the emulator here, with the mend; empty if nothing is known to prevent it."""
@@ -44,7 +47,7 @@ class Runtime(ABC):
         """
 
     def bundle(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
-        """The bundle that the emulator predicts, see `Emulator.predict`."""
+        """The bundle that the emulator predicts, see `Emulator.predict`; overridden to plan by the particles."""
         return emulator.predict(particles, context)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
@@ -59,6 +62,7 @@ class Eager(Runtime):
 
     name: ClassVar[str] = "eager"
     fixed_shapes: ClassVar[bool] = False
+    recordable: ClassVar[bool] = True
 
     def fields(self, network: GridProcessor, grid: Tensor, precision: torch.dtype) -> Tensor:
         if precision == torch.bfloat16 and not computes_bfloat16(grid.device):
