@@ -2,19 +2,21 @@
 
 import dataclasses
 import os
+import sys
+import warnings
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from nmpm.data.initial_states import lattice
 from nmpm.decoders import Absolute, Acceleration, Blend
-from nmpm.emulator import Emulator, rollout
+from nmpm.emulator import Emulator, RolloutContext, rollout
+from nmpm.emulator.engines import ENGINES, find_engine, rules
 from nmpm.emulator.engines.torch.engine import TorchEngine
-from nmpm.emulator.runtimes import Triton, cuda_graph
-from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.processors import UNet
-from nmpm.transfer import Quadratic, without_kernels
+from nmpm.transfer import without_kernels
 from tests.scenes import CHANNEL, box, cloud, emulator_of, with_obstacle
 
 if not torch.cuda.is_available():
@@ -62,21 +64,9 @@ def state_of(scene, **motion) -> Particles:
     return dataclasses.replace(state, gravity=gravity) if scene.gravity_varies else state
 
 
-def run_again(function, _):
-    """A stand-in for the GPU's recorder."""
-    made = function()
-
-    def replay():
-        again = function()
-        made.position.copy_(again.position)
-        made.velocity.copy_(again.velocity)
-
-    return replay, made
-
-
 @pytest.fixture
 def triton(monkeypatch, device):
-    """Lets emulators take the runtime; without a GPU in Triton's interpreter, and without a graph."""
+    """Lets emulators take the kernels; without a GPU in Triton's interpreter, and without recordings."""
     pytest.importorskip("triton", reason="triton is not installed")
     from nmpm.emulator.engines.triton import engine
 
@@ -84,8 +74,14 @@ def triton(monkeypatch, device):
     if device.type != "cuda":
         if torch.cuda.is_available():
             pytest.skip("kernels are compiled for the GPU: --device cuda")
-        monkeypatch.setattr(Triton, "unsupported_reason", lambda *_: "")
-        monkeypatch.setattr(cuda_graph, "record", run_again)
+        on_gpu(monkeypatch)
+
+
+def on_gpu(monkeypatch) -> None:
+    """Let engines be chosen as on a CUDA GPU with Triton."""
+    monkeypatch.setattr(rules.Call, "device", "cuda")
+    monkeypatch.setattr(rules, "RECORDINGS", (rules.Rule("a stand-in for a GPU", (), lambda _: True),))
+    monkeypatch.setattr(rules, "_has_triton", lambda: True)
 
 
 @pytest.mark.usefixtures("triton")
@@ -96,7 +92,7 @@ def test_bundles_are_those_of_tensor_operations(name, device):
     with torch.no_grad():
         context = emulator.context(state)
         for _ in range(2):
-            there = emulator.with_runtime("triton")(state, context)
+            there = ENGINES["triton"](emulator).predict(state, context)
             here = TorchEngine(emulator).predict(state, context)
             real = state.mask
             gap = (there.position - here.position).abs().amax((1, 3)) / emulator.grid.spacing[0]
@@ -113,29 +109,51 @@ def test_rollouts_go_on_from_states_of_any_size_and_precision(device):
         for given in (state, state.double()):
             with without_kernels():
                 expected = rollout(emulator, given, 6)
-            predicted = rollout(emulator.with_runtime("triton"), given, 6)
+            predicted = rollout(emulator, given, 6)
             assert predicted.dtype == expected.dtype
             torch.testing.assert_close(predicted, expected, rtol=0, atol=1e-4 * emulator.grid.spacing[0])
 
 
+@pytest.mark.usefixtures("triton")
+def test_kernels_that_give_what_torch_gives_are_used(device, recwarn):
+    emulator, state = moving(box(obstacles=True), energy=True).to(device), state_of(box(obstacles=True), **FAST)
+    emulator(state.to(device))
+    assert find_engine(emulator, state.to(device), emulator.solid(state.to(device))).name == "triton"
+    assert not recwarn.list
+
+
 @pytest.mark.parametrize(
-    ("change", "reason"),
+    ("change", "complaint"),
     [
-        (lambda emulator: emulator, "needs a CUDA GPU; the model is on cpu"),
-        (lambda emulator: emulator.to("cuda"), "needs Triton"),
-        (lambda _: moving(box(3)), "has no kernels for three dimensions: use cuda-graph or eager"),
-        (Emulator.double, "torch.float64"),
-        (lambda _: moving(box(), bounds="reflect"), "bounds: reflect"),
-        (lambda _: moving(box(), transfer=Quadratic()), "the transfers Nearest and Quadratic"),
-        (lambda _: moving(box(evolving=("heat",))), "fields"),
+        (lambda bundle: 1 / 0, r"they fail here \(ZeroDivisionError: division by zero\)"),
+        (
+            lambda b: dataclasses.replace(b, position=b.position + 0.01),
+            r"differ by 0.\d+ cells, where 0.001",
+        ),
+        (lambda b: dataclasses.replace(b, position=b.position * torch.nan), "differ by nan cells"),
+        (lambda bundle: bundle, ""),
     ],
-    ids=["cpu", "no Triton", "3-D", "float64", "bounds", "transfer", "fields"],
+    ids=["fail", "differ", "are not finite", "agree"],
 )
-def test_what_the_kernels_do_not_take_is_refused(change, reason, monkeypatch):
-    monkeypatch.setattr(Emulator, "to", lambda emulator, _: emulator)
-    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    emulator = change(moving(box()))
-    if "cpu" not in reason:
-        monkeypatch.setattr(Emulator, "device", torch.device("cuda"))
-    with pytest.raises(ConfigError, match=f"The runtime triton .*{reason}"):
-        emulator.with_runtime("triton")
+def test_kernels_that_fail_or_differ_are_left_to_torch_with_one_warning(change, complaint, monkeypatch):
+    class Kernels(TorchEngine):
+        """Torch's operations with a change."""
+
+        name = "triton"
+
+        def predict(self, particles, context):
+            return change(super().predict(particles, context))
+
+    made = SimpleNamespace(TritonEngine=lambda emulator, _: Kernels(emulator))
+    monkeypatch.setitem(sys.modules, "nmpm.emulator.engines.triton.engine", made)
+    on_gpu(monkeypatch)
+    emulator, state = moving(box(), energy=True), state_of(box())
+    expected = TorchEngine(emulator).predict(state, RolloutContext(emulator.solid(state), emulator.budget(state)))
+    if complaint:
+        with pytest.warns(UserWarning, match=f"Kernels in Triton are not used on cpu, but torch's.*{complaint}"):
+            emulator.context(state)
+    for _ in range(2):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert torch.equal(emulator(state).position, expected.position)
+    assert find_engine(emulator, state, emulator.solid(state)).name == ("torch" if complaint else "triton")

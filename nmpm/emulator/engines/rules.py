@@ -75,6 +75,10 @@ def _need_gradients(tensors: Iterable[Tensor]) -> bool:
     return torch.is_grad_enabled() and any(values.requires_grad for values in tensors)
 
 
+def _is_recording() -> bool:
+    return torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()
+
+
 @cache
 def _has_triton() -> bool:
     return importlib.util.find_spec("triton") is not None
@@ -138,7 +142,11 @@ RECORDINGS: tuple[Rule[Call], ...] = (
     Rule("autocast", (), lambda call: _is_autocast(call.device)),
     Rule("graphs that torch.compile traces", (), lambda _: torch.compiler.is_compiling()),
     Rule("nmpm.transfer.without_kernels and scatter_backend", (), lambda _: not is_default()),
-    Rule("a recording of something else", (), lambda _: torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()),
+    Rule(
+        "a recording of something else",
+        (),
+        lambda _: _is_recording(),
+    ),
 )
 """What calls that are recorded as CUDA graphs cannot have, whichever engine computes them."""
 

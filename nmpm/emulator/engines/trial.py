@@ -71,7 +71,7 @@ def _difference(emulator: Emulator, particles: Particles, solid: Tensor) -> str:
 
 
 def _apart(emulator: Emulator, particles: Particles, context: RolloutContext) -> tuple[float, Tensor]:
-    """How far the network's inputs are apart on average, and (P,) each particle in cells, by the same network output."""
+    """How far the network's inputs are apart on average, and (P,) particles in cells, by the same network output."""
     from nmpm.emulator.engines.triton.engine import TritonEngine  # Triton comes with torch's builds for CUDA
 
     output = _SharedOutput(emulator.runtime)

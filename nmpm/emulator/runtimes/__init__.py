@@ -25,9 +25,7 @@ __all__ = [
     "find_runtime",
 ]
 
-RUNTIMES: Mapping[str, type[Runtime]] = MappingProxyType(
-    {kind.name: kind for kind in (OpenVINO, Windows, Eager)}
-)
+RUNTIMES: Mapping[str, type[Runtime]] = MappingProxyType({kind.name: kind for kind in (OpenVINO, Windows, Eager)})
 """Runtimes by name; the last one runs every network everywhere."""
 FORMER: Mapping[str, str] = MappingProxyType(
     {
@@ -51,7 +49,7 @@ def find_runtime(name: str) -> Runtime:
 
 
 def check_runtime(name: str, names: Sequence[str]) -> None:
-    """Check the name of a runtime; raises ConfigError if it is neither one of these names, which are listed, nor of `FORMER`."""
+    """Check the name of a runtime; raises ConfigError, with these names, if it is not among them or `FORMER`."""
     if name not in names and name not in FORMER:
         raise ConfigError(
             f"No runtime is called {one_line(repr(name), 60)}; there are {', '.join(names)}."
