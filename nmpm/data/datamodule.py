@@ -15,7 +15,7 @@ from nmpm._support.plain_data import from_plain
 from nmpm.data.convert import Options
 from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
 from nmpm.data.loading.evaluation import EvaluationLoader
-from nmpm.data.loading.model_frames import check_horizon
+from nmpm.data.loading.model_frames import check_observed
 from nmpm.data.loading.padded_batch import pin_for
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.sources import SourceName, hold_out, make_source
@@ -204,7 +204,7 @@ class TrajectoryDataModule(LightningDataModule):
         history = self._history
         if history is None or history.start.batch > self.batches_seen:  # (the batch-size finder starts over)
             history = _BatchHistory(PlanStart(), self.batch_size, world)
-        check_horizon(self.horizon, self.reading)
+        check_observed(self.horizon, self.reading)
         self._provider, plan = self.data_source.training_data(
             self.horizon + 2,
             self.reading,

@@ -24,14 +24,17 @@ class SimilarGrid:
     Args:
         domain: What it covers, (lower, upper) per axis, in the data's units.
         cells: Along each axis.
-        widths: Of a cell, along each axis.
         misfit: Cells² by which layers at the upper ends are thicker than the model's, added over the axes.
     """
 
     domain: tuple[Interval, ...]
     cells: tuple[int, ...]
-    widths: tuple[float, ...]
     misfit: float
+
+    @property
+    def widths(self) -> tuple[float, ...]:
+        """Of a cell, along each axis."""
+        return tuple((high - low) / n for (low, high), n in zip(self.domain, self.cells, strict=True))
 
 
 def similar_grid(recipe: EmulatorRecipe, scene: Scene, scale: float) -> SimilarGrid:
@@ -40,17 +43,9 @@ def similar_grid(recipe: EmulatorRecipe, scene: Scene, scale: float) -> SimilarG
     Layers beyond the bounds are as thick as the model's, in cells, at the lower end of an axis, and at least as thick
     at the upper one. Without layers, and on periodic axes, the cells are the nearest number that the network takes.
     """
-    axes = []
-    for axis, (bounds, kind, width) in enumerate(zip(scene.bounds, scene.boundary, recipe.grid.spacing, strict=True)):
-        takes = _network_takes(recipe, periodic=kind == "periodic")
-        layers = _layers(recipe, axis, kind)
-        if kind == "periodic" or (kind == "wall" and layers == (0, 0)):
-            axes.append((bounds, _nearest_cells((bounds[1] - bounds[0]) / (scale * width), takes), 0.0))
-        else:
-            axes.append(_walled_axis(bounds, scale * width, layers, takes))
+    axes = [_fit_axis(recipe, scene, axis, scale * width) for axis, width in enumerate(recipe.grid.spacing)]
     domain, cells, misfits = zip(*axes, strict=True)
-    widths = tuple((high - low) / n for (low, high), n in zip(domain, cells, strict=True))
-    return SimilarGrid(domain, cells, widths, sum(misfits))
+    return SimilarGrid(domain, cells, sum(misfits))
 
 
 def aligned_scales(recipe: EmulatorRecipe, scene: Scene, scale: float, alignment: int) -> list[float]:
@@ -62,6 +57,22 @@ def aligned_scales(recipe: EmulatorRecipe, scene: Scene, scale: float, alignment
         numbers = (n for n in range(round(blocks) - 2, round(blocks) + 3) if 0.75 <= n / blocks <= 4 / 3)
         scales += [extent / (n * alignment - walls) for n in numbers if n * alignment > walls]
     return scales
+
+
+def _fit_axis(recipe: EmulatorRecipe, scene: Scene, axis: int, width: float) -> tuple[Interval, int, float]:
+    """Domain, number of cells of about a width, and misfit of an axis."""
+    (low, high), kind = scene.bounds[axis], scene.boundary[axis]
+    takes, (lower, upper) = _network_takes(recipe, kind == "periodic"), _layers(recipe, axis, kind)
+    across = (high - low) / width
+    if kind == "periodic" or (kind == "wall" and lower == upper == 0):
+        near = range(max(1, math.floor(across) - _TRIES), math.ceil(across) + _TRIES)
+        nearest_first = sorted(near, key=lambda n: abs(math.log(n / across)))
+        return (low, high), next(filter(takes, nearest_first), max(1, round(across))), 0.0
+    needed = lower + across + upper
+    least = max(1, math.ceil(needed - _SAME))
+    cells = next(filter(takes, range(least, least + _TRIES)), least)
+    first = low - lower * width
+    return (first, max(first + cells * width, high)), cells, max(0.0, cells - needed) ** 2
 
 
 def _network_takes(recipe: EmulatorRecipe, periodic: bool) -> Callable[[int], bool]:
@@ -76,23 +87,6 @@ def _network_takes(recipe: EmulatorRecipe, periodic: bool) -> Callable[[int], bo
         return True
 
     return takes
-
-
-def _nearest_cells(cells: float, takes: Callable[[int], bool]) -> int:
-    """The whole number of cells that the network takes nearest to this one."""
-    nearest = range(max(1, math.floor(cells) - _TRIES), math.ceil(cells) + _TRIES)
-    return next(filter(takes, sorted(nearest, key=lambda n: abs(math.log(n / cells)))), max(1, round(cells)))
-
-
-def _walled_axis(
-    bounds: Interval, width: float, layers: Interval, takes: Callable[[int], bool]
-) -> tuple[Interval, int, float]:
-    """Domain, cells and misfit of an axis with layers beyond its bounds, as thick as given in cells, or more."""
-    needed = layers[0] + (bounds[1] - bounds[0]) / width + layers[1]
-    least = max(1, math.ceil(needed - _SAME))
-    cells = next(filter(takes, range(least, least + _TRIES)), least)
-    lower = bounds[0] - layers[0] * width
-    return (lower, max(lower + cells * width, bounds[1])), cells, max(0.0, cells - needed) ** 2
 
 
 def _layers(recipe: EmulatorRecipe, axis: int, kind: Boundary) -> Interval:

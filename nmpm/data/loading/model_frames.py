@@ -22,8 +22,8 @@ _MOST_CHANGE = 0.5
 """Of a step by which the next may differ; of 0.25 to 1 the best for velocities of thinned grains, sand and water."""
 
 
-def check_horizon(horizon: int, reading: Reading) -> None:
-    """Raise ConfigError if the data have none of the model's frames that a training step predicts."""
+def check_observed(horizon: int, reading: Reading) -> None:
+    """Raise ConfigError if the data have none of the frames that a training step predicts."""
     if reading.between > horizon:
         raise ConfigError(
             f"The data have every {reading.between}th of the model's frames, none of the {horizon} that a training step"
@@ -45,13 +45,13 @@ def add_frames(window: Window, between: int, has_earlier: Tensor) -> Window:
         has_earlier: (B,) whether the data have the first frame; otherwise it is of any value.
     """
     frames, present = window.frames, window.present
-    known = torch.ones_like(frames[..., 0], dtype=torch.bool) if present is None else present
-    known = torch.cat([known[:, :1] & has_earlier[:, None, None], known[:, 1:]], dim=1)
+    there = torch.ones_like(frames[..., 0], dtype=torch.bool) if present is None else present
+    there = torch.cat([there[:, :1] & has_earlier[:, None, None], there[:, 1:]], dim=1)
+    throughout = (there[:, 2:] & there[:, 1:-1] & there[:, :-2]).unsqueeze(-1)
     change = frames.diff(n=2, dim=1)
-    change_known = (known[:, 2:] & known[:, 1:-1] & known[:, :-2]).unsqueeze(-1)
     velocity = model_velocity(
         frames[:, 2] - frames[:, 1],
-        change[:, 0].where(change_known[:, 0], torch.nan),
+        change[:, 0].where(throughout[:, 0], torch.nan),
         window.gravity.unsqueeze(1) * between**2,
         1 / between,
     )
@@ -59,7 +59,7 @@ def add_frames(window: Window, between: int, has_earlier: Tensor) -> Window:
     def model_frames(values: Tensor, change: Tensor | None = None) -> Tensor:
         return interpolate(values[:, 1:], between, change)[:, between - 1 :]
 
-    path = model_frames(frames, change.where(change_known, 0.0)[:, 1:])
+    path = model_frames(frames, change.where(throughout, 0.0)[:, 1:])
     path[:, 0] = path[:, 1] - velocity
     observed = torch.zeros(path.shape[:2], dtype=torch.bool, device=path.device)
     observed[:, 1::between] = True
