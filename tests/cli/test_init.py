@@ -32,6 +32,12 @@ def test_fit_without_a_configuration_writes_and_takes_that_of_init(make_dataset,
     assert "run already holds a run" in capsys.readouterr().err
 
 
+def test_a_configuration_states_obstacles_that_move_as_recorded(make_dataset):
+    folder = str(make_dataset(train=((40, 9),), valid=(), test=(), statics=4))
+    assert main(["init", folder, "--prescribed", "3", "--out", "made.yaml"]) == 0
+    assert yaml.safe_load(Path("made.yaml").read_text())["data"]["prescribed"] == [3]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

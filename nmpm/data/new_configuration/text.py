@@ -134,7 +134,7 @@ def _facts(source: CompletedSource) -> dict[str, Entry]:
     """Options of the datamodule, by which the user, or what was found, completes the metadata."""
     given = {name: getattr(source.data.options, name) for name in OPTIONS}
     return {
-        name: (json.dumps(value), source.hows.get(name, "as given"))
+        name: (json.dumps(value, default=sorted), source.hows.get(name, "as given"))
         for name, value in given.items()
         if value is not None
     }
