@@ -1,3 +1,4 @@
+import json
 from collections import Counter
 from itertools import islice
 from types import SimpleNamespace
@@ -7,7 +8,9 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, OnExceptionCheckpoint
 
+from nmpm.data.convert import Options
 from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.data.format import METADATA_FILE
 from nmpm.data.inspection import inspect
 from nmpm.data.loading.sources import FolderSource
 from nmpm.errors import ConfigError, DataError
@@ -241,3 +244,22 @@ def test_files_that_do_not_suffice_are_named(make_dataset):
     with pytest.raises(DataError, match=r"no valid.h5 there.*Rename validation.h5 to valid.h5"):
         module_of(folder).val_dataloader()
     assert any("Rename validation.h5" in finding.sentence for finding in inspect(FolderSource(folder)).findings)
+
+
+@pytest.mark.usefixtures("home")
+def test_what_type_ids_tell_needs_no_statement_and_others_can_be_named(make_dataset):
+    folder = make_dataset(train=(), valid=(), statics=2)
+    keys = json.loads((folder / METADATA_FILE).read_text())
+    del keys["particle_types"], keys["static_types"]
+    (folder / METADATA_FILE).write_text(json.dumps(keys))
+    source = FolderSource(folder)
+    assert (source.scene.materials, source.scene.obstacles) == (("goop",), True)
+    assert source.metadata.particle_types[7] == "goop"
+    named = FolderSource(folder, Options(types={7: "slime", 3: "wall"}))
+    assert (named.scene.materials, named.scene.obstacles) == (("slime",), True)
+    with pytest.raises(DataError, match=r"no train\.h5 there \(beside it: test\.h5\)"):
+        source.split("train")
+    converted = FolderSource(folder, Options(smooth=5))
+    assert converted.scene.materials == ("goop",)
+    with pytest.raises(DataError, match=r"dataset: no trajectories for train, only for test\. Files or folders"):
+        converted.split("train")
