@@ -1,5 +1,5 @@
-"""Steps of a call on a CUDA GPU as kernels in Triton, for `nmpm.emulator.runtimes.Triton`.
+"""Steps of a call on a CUDA GPU as kernels in Triton.
 
-`grid` has the kernels between particles and grid, `motion` those that move particles, `constraints` those that change
-paths; `steps` launches them.
+`grid` has the kernels from particles to grid, `motion` those that move particles, `contact`, `rest` and `crowding`
+those that change paths; `engine` launches them, as `launch` says.
 """

@@ -1,4 +1,4 @@
-"""Kernels between particles and grid, in Triton: what `nmpm.emulator.rasterise` and `support` compute.
+"""Kernels between particles and grid, in Triton: what `nmpm.emulator.rasterise` computes.
 
 Particles are rows (B N, 2), nodes rows (B size, channels), the last axis of the grid fastest; a program treats a block
 of them in the scene `program_id(1)`. The grid has (nx, ny) nodes; all is in cells. Names in capitals are known when a
@@ -8,7 +8,11 @@ kernel is compiled: which axes wrap, the number of materials, what a model has.
 import triton
 import triton.language as tl
 
-SIZES = ("nx", "ny", "count", "tiles", "frame", "frames", "per_scene", "per_frame", "per_channel", "per_row")
+SIZES = (
+    "nx", "ny", "size", "count", "tiles", "entries", "frame", "frames", "channels", "outputs", "per_scene", "per_frame",
+    "per_channel", "per_row", "per_column", "per_end", "per_axis", "apart",
+    "cells_apart", "path_apart",
+)  # fmt: skip
 """Numbers that a kernel is not compiled for: models and batches differ in them."""
 
 
@@ -52,90 +56,100 @@ def _add(sums, node, weight, u, v, kind, active, MATERIALS: tl.constexpr):
     tl.atomic_add(row + 2 * MATERIALS + kind, weight, mask=active, sem="relaxed")
 
 
+@triton.jit
+def load_kind(material, row, active, BLOCK: tl.constexpr, MATERIALS: tl.constexpr):
+    """Indices of materials, which may be out of range."""
+    kind = tl.zeros((BLOCK,), tl.int32)
+    if MATERIALS > 1:
+        kind = tl.load(material + row, mask=active, other=0).to(tl.int32)
+    return kind
+
+
 @triton.jit(do_not_specialize=SIZES)
-def scatter(cells, velocity, material, mask, sums, count, nx, ny, WX: tl.constexpr, WY: tl.constexpr,
-            MATERIALS: tl.constexpr, BLOCK: tl.constexpr):  # fmt: skip
-    """Add momenta and numbers of particles to `sums` (B size, 2 M + M) of each material."""
+def scatter(position, velocity, gravity, material, volume, cells, moved, pull, sums, count, apart, low_x, low_y, wide_x,
+            wide_y, nx, ny, WX: tl.constexpr, WY: tl.constexpr, MATERIALS: tl.constexpr, CONVERT: tl.constexpr,
+            BLOCK: tl.constexpr):  # fmt: skip
+    """Add momenta and volumes of particles to `sums` (B size, 2 M + M) of each material.
+
+    `volume` (B, N) are multiples of the scene's, 0 for padding. If CONVERT, positions (B, N, 2), velocities (B, N, 2)
+    and gravity (B, 2) are in domain length, and `cells`, whose scenes are `apart` particles apart, `moved` and `pull`
+    are filled with those in cells.
+    """
     scene = tl.program_id(1).to(tl.int64)
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside, row = p < count, scene * count + p
-    active = inside & (tl.load(mask + row, mask=inside, other=0) != 0)
+    share = tl.load(volume + row, mask=inside, other=0).to(tl.float32)
+    x, y = tl.load(position + 2 * row, mask=inside, other=0.0), tl.load(position + 2 * row + 1, mask=inside, other=0.0)
     u, v = tl.load(velocity + 2 * row, mask=inside, other=0.0), tl.load(velocity + 2 * row + 1, mask=inside, other=0.0)
-    kind = tl.zeros((BLOCK,), tl.int32)
-    if MATERIALS > 1:
-        kind = tl.load(material + row, mask=inside, other=0).to(tl.int32)
-        active = active & (kind >= 0) & (kind < MATERIALS)
-    i0, i1, a = find_nodes(tl.load(cells + 2 * row, mask=inside, other=0.0), nx, WX)
-    j0, j1, b = find_nodes(tl.load(cells + 2 * row + 1, mask=inside, other=0.0), ny, WY)
+    if CONVERT:
+        x, y = ((x - low_x) / wide_x).to(tl.float32), ((y - low_y) / wide_y).to(tl.float32)
+        u, v = (u / wide_x).to(tl.float32), (v / wide_y).to(tl.float32)
+        tl.store(cells + 2 * (scene * apart + p), x, mask=inside)
+        tl.store(cells + 2 * (scene * apart + p) + 1, y, mask=inside)
+        tl.store(moved + 2 * row, u, mask=inside)
+        tl.store(moved + 2 * row + 1, v, mask=inside)
+        tl.store(pull + 2 * scene, (tl.load(gravity + 2 * scene) / wide_x).to(tl.float32))  # by all of its programs
+        tl.store(pull + 2 * scene + 1, (tl.load(gravity + 2 * scene + 1) / wide_y).to(tl.float32))
+    kind = load_kind(material, row, inside, BLOCK, MATERIALS)
+    active = inside & (share > 0) & (kind >= 0) & (kind < MATERIALS)
+    i0, i1, a = find_nodes(x, nx, WX)
+    j0, j1, b = find_nodes(y, ny, WY)
     nodes = sums + scene * (nx * ny * 3 * MATERIALS)
-    _add(nodes, i0 * ny + j0, (1 - a) * (1 - b), u, v, kind, active, MATERIALS)
-    _add(nodes, i0 * ny + j1, (1 - a) * b, u, v, kind, active, MATERIALS)
-    _add(nodes, i1 * ny + j0, a * (1 - b), u, v, kind, active, MATERIALS)
-    _add(nodes, i1 * ny + j1, a * b, u, v, kind, active, MATERIALS)
+    _add(nodes, i0 * ny + j0, share * (1 - a) * (1 - b), u, v, kind, active, MATERIALS)
+    _add(nodes, i0 * ny + j1, share * (1 - a) * b, u, v, kind, active, MATERIALS)
+    _add(nodes, i1 * ny + j0, share * a * (1 - b), u, v, kind, active, MATERIALS)
+    _add(nodes, i1 * ny + j1, share * a * b, u, v, kind, active, MATERIALS)
 
 
 @triton.jit
-def _filled(filled, column, row, extent, across, stride, side, period, ENOUGH: tl.constexpr):
-    """Whether there is so much material in a cell; columns around the end are `period` away, 0 where none wrap."""
-    column = tl.where(column < 0, column + period, column)
-    column = tl.where(column >= across, column - period, column)
-    inside = (column >= 0) & (column < across) & (row >= 0) & (row < extent)
-    return tl.load(filled + row * stride + column * side, mask=inside, other=0.0) >= ENOUGH
-
-
-@triton.jit
-def _bears(filled, share, column, row, lowest, up, floor, extent, across, stride, side, period,
-           OBSTACLES: tl.constexpr, ENOUGH: tl.constexpr, SURFACE: tl.constexpr):  # fmt: skip
-    """Whether cells, `row` up from the lowest, bear what lies on them, and whether they are floor or obstacle."""
-    here = lowest + up * row
-    bears = _filled(filled, column, here, extent, across, stride, side, period, ENOUGH)
-    bears = bears | _filled(filled, column - 1, here, extent, across, stride, side, period, ENOUGH)
-    bears = bears | _filled(filled, column + 1, here, extent, across, stride, side, period, ENOUGH)
-    base = (row < floor) & (column < across)
-    if OBSTACLES:
-        inside = (column < across) & (row >= 0) & (row < extent)
-        base = base | (tl.load(share + here * stride + column * side, mask=inside, other=0.0) >= SURFACE)
-    return bears | base, base
-
-
-@triton.jit
-def _larger(a, b):
-    return tl.maximum(a, b)
+def _fill(state, seen, low, high, mean, deviation, row, channel, value, active, SEEN: tl.constexpr):
+    """Store a channel's values at nodes' rows, and if SEEN, what the network sees of them."""
+    tl.store(state + row + channel, value, mask=active)
+    if SEEN:
+        lowest, highest = tl.load(low + channel), tl.load(high + channel)
+        value = tl.where(value > highest, highest, value)
+        value = tl.where(value < lowest, lowest, value)
+        tl.store(seen + row + channel, (value - tl.load(mean + channel)) / tl.load(deviation + channel), mask=active)
 
 
 @triton.jit(do_not_specialize=SIZES)
-def support(filled, share, gravity, held, nx, ny, WX: tl.constexpr, WY: tl.constexpr, LEFT: tl.constexpr,
-            RIGHT: tl.constexpr, DOWN: tl.constexpr, UP: tl.constexpr, OBSTACLES: tl.constexpr, REACH: tl.constexpr,
-            ENOUGH: tl.constexpr, SURFACE: tl.constexpr, ROWS: tl.constexpr, COLUMNS: tl.constexpr):  # fmt: skip
-    """Fill in whether the material in each cell is held up, `held` (B size,) int8: a program treats some columns.
+def fill_state(sums, solid, per_scene, walls, gravity, low, high, mean, deviation, state, seen, share, particle,
+               channels, size, MATERIALS: tl.constexpr, SOLID: tl.constexpr, CONSTANTS: tl.constexpr,
+               OBSTACLES: tl.constexpr, SEEN: tl.constexpr, BLOCK: tl.constexpr):  # fmt: skip
+    """Fill in the grid state (B size, channels) from the sums of `scatter`.
 
-    `filled` and `share` (B size,) are what of each cell is material, and what of its room is obstacle. ROWS is a power
-    of two, at least the grid's longest axis; LEFT, RIGHT, DOWN and UP are the rows beyond the bounds at its ends.
+    Args:
+        sums: (B size, 3 M).
+        solid: (B, size) share of each cell that is wall or obstacle, with scenes `per_scene` apart; if SOLID.
+        walls: (size,) share of each cell that is wall.
+        gravity: (B, 2), if CONSTANTS.
+        low, high, mean, deviation: (channels,) statistics of the network's input.
+        state: (B size, channels), is filled; if SEEN, `seen` likewise with what the network sees.
+        share: (B size,), is filled if OBSTACLES: share of each cell's room that is obstacle.
+        particle: Volume of a particle, as a share of a cell.
     """
     scene = tl.program_id(1).to(tl.int64)
-    pull_x, pull_y = tl.load(gravity + 2 * scene), tl.load(gravity + 2 * scene + 1)
-    vertical = tl.abs(pull_y) > tl.abs(pull_x)
-    extent, across = tl.where(vertical, ny, nx), tl.where(vertical, nx, ny)
-    stride, side = tl.where(vertical, 1, ny), tl.where(vertical, ny, 1)
-    upwards = tl.where(vertical, pull_y, pull_x) > 0
-    lowest, up = tl.where(upwards, extent - 1, 0), tl.where(upwards, -1, 1)
-    floor = tl.where(vertical, tl.where(upwards, UP, DOWN), tl.where(upwards, RIGHT, LEFT))
-    period = tl.where(vertical, WX * nx, WY * ny)
-    bound = tl.where((pull_x == 0) & (pull_y == 0), 0, tl.where(vertical, 1 - WY, 1 - WX))  # 0: all is held
-    column = (tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS))[:, None]
-    row = tl.arange(0, ROWS)[None, :]
-    full, solid = filled + scene * (nx * ny), share + scene * (nx * ny)
-    near, base = _bears(full, solid, column, row, lowest, up, floor, extent, across, stride, side, period,
-                        OBSTACLES, ENOUGH, SURFACE)  # fmt: skip
-    for distance in tl.static_range(1, REACH):
-        below, _ = _bears(full, solid, column, row - distance, lowest, up, floor, extent, across, stride, side, period,
-                          OBSTACLES, ENOUGH, SURFACE)  # fmt: skip
-        near = near | below | (row < distance)
-    gap = tl.associative_scan(tl.where(near, 0, (row + 1) * bound), 1, _larger)
-    ground = tl.associative_scan(tl.where(base, row + 1, 0), 1, _larger)
-    target = held + scene * (nx * ny) + column * side
-    above = row + 1  # is held if there is no gap since the last floor or obstacle
-    tl.store(target + (lowest + up * above) * stride, (gap <= ground).to(tl.int8),
-             mask=(column < across) & (above < extent))  # fmt: skip
-    tl.store(target + (lowest + up * row) * stride, tl.full((COLUMNS, ROWS), 1, tl.int8),
-             mask=(column < across) & (row == 0))  # fmt: skip
+    node = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    active = node < size
+    cell = scene * size + node
+    row, total = cell * channels, sums + cell * (3 * MATERIALS)
+    for kind in tl.static_range(MATERIALS):
+        count = tl.load(total + 2 * MATERIALS + kind, mask=active, other=0.0)
+        divisor = tl.where(count > 0, count, 1.0)
+        for axis in tl.static_range(2):
+            value = tl.load(total + 2 * kind + axis, mask=active, other=0.0) / divisor
+            _fill(state, seen, low, high, mean, deviation, row, 2 * kind + axis, value, active, SEEN)
+        filled = count * particle
+        _fill(state, seen, low, high, mean, deviation, row, 2 * MATERIALS + kind, filled, active, SEEN)
+    if SOLID:
+        taken = tl.load(solid + scene * per_scene + node, mask=active, other=0.0)
+        _fill(state, seen, low, high, mean, deviation, row, 3 * MATERIALS, taken, active, SEEN)
+        if OBSTACLES:
+            wall = tl.load(walls + node, mask=active, other=0.0)
+            part = tl.minimum(tl.maximum((taken - wall) / tl.maximum(1 - wall, 1e-6), 0.0), 1.0)
+            tl.store(share + cell, tl.where(wall < 1, part, 0.0), mask=active)
+    if CONSTANTS:
+        pull_x = tl.load(gravity + 2 * scene) + tl.zeros((BLOCK,), tl.float32)
+        pull_y = tl.load(gravity + 2 * scene + 1) + tl.zeros((BLOCK,), tl.float32)
+        _fill(state, seen, low, high, mean, deviation, row, 3 * MATERIALS + SOLID, pull_x, active, SEEN)
+        _fill(state, seen, low, high, mean, deviation, row, 3 * MATERIALS + SOLID + 1, pull_y, active, SEEN)
