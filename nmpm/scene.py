@@ -245,11 +245,6 @@ class Reading:
         if min(self.every, self.between) < 1 or max(self.every, self.between) > 1 < min(self.every, self.between):
             raise ConfigError(f"every = {self.every}, between = {self.between}: one is 1, the other 1 or more.")
 
-    @property
-    def is_plain(self) -> bool:
-        """Whether the dataset is read with its own materials and frames."""
-        return not self.materials and self.every == self.between == 1
-
     def data_frames(self, frames: int) -> int:
         """Frames of the dataset that a window of at least so many frames of the model needs, 3 or more."""
         return self.every * (frames - 1) + 1 if self.between == 1 else 2 + math.ceil((frames - 2) / self.between)

@@ -20,7 +20,7 @@ from nmpm.data.loading.sources import FolderSource
 from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.similarity import Match
 from nmpm.errors import ConfigError, NmpmError
-from nmpm.scene import Scene
+from nmpm.scene import Reading, Scene
 from nmpm.training.checkpoints import COMPARED, read_checkpoint
 from nmpm.zoo.entries import load_checkpoint
 from nmpm.zoo.matching import match_data
@@ -93,7 +93,7 @@ class MatchedRun:
 
     @property
     def _is_same_kind(self) -> bool:
-        return self.match.reading.is_plain and self.match.reading.scene == self.scene
+        return self.match.reading == Reading(self.scene)
 
     def complete(self, config: Namespace) -> None:
         """Put the model's form, and how the data are read, into a configuration."""

@@ -14,6 +14,7 @@ from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.cli.emulator_cli import EmulatorCLI
 from nmpm.data.format import Split, read_metadata, write_metadata, write_split
+from nmpm.scene import Reading
 from nmpm.zoo import Zoo
 from tests.made_up import made_up_metadata, made_up_trajectory
 
@@ -205,7 +206,7 @@ def test_on_data_of_its_own_a_model_changes_nothing_of_its_configuration(monkeyp
     (cli,) = built
     assert str(cli.matched) == ""
     assert cli.config["fit"]["model"]["cells"] == 32
-    assert cli.datamodule.reading.is_plain
+    assert cli.datamodule.reading == Reading(cli.datamodule.data_source.scene)
 
 
 def test_models_are_compared_on_data_of_another_kind(capsys, monkeypatch):

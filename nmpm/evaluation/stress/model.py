@@ -49,7 +49,7 @@ class ModelUnderTest:
     def over(self, preset: Preset, match: Match) -> ModelUnderTest:
         """The same test on the scenes of another preset, with a match of the emulator with them."""
         reading = match.reading
-        if reading.is_plain and reading.scene == preset.scene:
+        if reading == Reading(preset.scene):
             return replace(self, preset=preset)
         stride = Fraction(reading.every, reading.between)
         return replace(

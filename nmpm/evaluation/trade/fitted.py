@@ -69,7 +69,8 @@ def fit_to_scenes(
     except ConfigError as error:
         raise ConfigError(f"The model {name} cannot predict the scenes of {scenes.name}. {error}") from error
     ours, theirs = match.reading.scene, scenes.scene
-    if match.reading.is_plain and (ours.materials, ours.gravity_known) == (theirs.materials, theirs.gravity_known):
+    same_facts = (ours.materials, ours.gravity_known) == (theirs.materials, theirs.gravity_known)
+    if match.reading == Reading(ours) and same_facts:
         return FittedModel(name, weights, emulator.matched(match), ", ".join(differing))
     for warning in match.warnings:
         warnings.warn(warning, stacklevel=3)
