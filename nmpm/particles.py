@@ -261,7 +261,7 @@ def scene_volumes(volume: Tensor | None, mask: Tensor) -> Tensor | None:
     Reads a value back from the device.
     """
     if volume is None:
-        return mask.new_ones(len(mask), dtype=torch.get_default_dtype())
+        return mask.new_ones(mask.shape[0], dtype=torch.get_default_dtype())
     of_scene = torch.where(mask, volume, 0.0).amax(1) if mask.shape[1] else volume.new_ones(len(volume))
     return of_scene if bool(((volume == of_scene.unsqueeze(1)) | ~mask).all()) else None
 
