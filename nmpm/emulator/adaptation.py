@@ -20,10 +20,9 @@ from nmpm.processors import GridLayout
 from nmpm.processors.channels import ChannelChange, OutputSource
 from nmpm.scene import Scene
 
-SOLID_STD = 0.25
+_SOLID_STD = 0.25
 """Standard deviation of an added solid channel: that of walls and obstacles in a fifteenth of the cells."""
-
-GRAVITY = 0.004
+_GRAVITY = 0.004
 """Cells per frame²: the size of gravity, for the statistics of its channels, where the emulator's scenes had none."""
 
 
@@ -68,13 +67,11 @@ def _channels(scene: Scene) -> tuple[tuple[str, ...], ...]:
 
 def _statistics(emulator: Emulator, other: Emulator) -> dict[str, Tensor]:
     """The other's statistics: those of channels and fields of the same name, and neutral ones."""
-    old, new = emulator.scene, other.scene
-    state = emulator.state_dict()
+    old, new, state = emulator.scene, other.scene, emulator.state_dict()
     result = {"calibrated": emulator.calibrated}
     for name in ("input_mean", "input_low", "input_high"):
         result[name] = _by_name(state[name], old.input_channels, getattr(other, name), new.input_channels)
-    stds = [_input_std(emulator, name) for name in new.input_channels]
-    result["input_std"] = torch.stack(stds)
+    result["input_std"] = torch.stack([_input_std(emulator, name) for name in new.input_channels])
     result["output_scale"] = torch.stack([_output_scale(emulator, name) for name in new.output_channels], dim=1)
     for name in ("mean", "std") if new.fields else ():
         neutral = getattr(other.field_scales, name)
@@ -101,12 +98,11 @@ def _input_std(emulator: Emulator, name: str) -> Tensor:
     """The standard deviation (1, ...) of an input channel."""
     if like := _like(name, emulator.scene.input_channels):
         return emulator.input_std[like].mean(0)
-    if name == "solid":
-        return torch.full_like(emulator.input_std[0], SOLID_STD)
+    value = _SOLID_STD if name == "solid" else 1.0
     if name.startswith("gravity_"):
-        size = float(torch.linalg.vector_norm(_gravity(emulator.recipe))) or GRAVITY
-        return torch.full_like(emulator.input_std[0], size / emulator.scene.dim**0.5)
-    return torch.ones_like(emulator.input_std[0])
+        size = float(torch.linalg.vector_norm(_gravity(emulator.recipe))) or _GRAVITY
+        value = size / emulator.scene.dim**0.5
+    return torch.full_like(emulator.input_std[0], value)
 
 
 def _output_scale(emulator: Emulator, name: str) -> Tensor:
@@ -139,17 +135,14 @@ def _weights(emulator: Emulator, other: Emulator) -> dict[str, Tensor]:
         [OutputSource((_like(name, rates) or [0])[0], name not in rates) for name in new.output_channels],
         _absent(emulator, other.recipe),
     )
-    prefix = "processor."
-    state = emulator.state_dict().items()
-    weights = {name.removeprefix(prefix): values for name, values in state if name.startswith(prefix)}
-    return {prefix + name: values for name, values in change.weights(weights).items()}
+    weights = change.weights(emulator.processor.state_dict())
+    return {f"processor.{name}": values for name, values in weights.items()}
 
 
 def _absent(emulator: Emulator, recipe: EmulatorRecipe) -> Tensor:
     """(C_in,) the normalised input channels of an emulator where nothing is, in the scene of another recipe."""
-    empty = torch.zeros_like(emulator.input_mean)
-    names, gravity = emulator.scene.input_channels, _gravity(recipe)
-    for index, name in enumerate(names):
+    empty, gravity = torch.zeros_like(emulator.input_mean), _gravity(recipe)
+    for index, name in enumerate(emulator.scene.input_channels):
         if name.startswith("gravity_"):
             empty[index] = gravity["xyz".index(name[-1])]
     return emulator.normalise(empty.unsqueeze(0)).flatten()
