@@ -176,6 +176,13 @@ def _short(values: np.ndarray) -> str:
     return "(" + ", ".join(f"{value:.3g}" for value in np.atleast_1d(values)) + ")"
 
 
+def are_outside(position: np.ndarray, domain: Sequence[Interval], boundary: Sequence[Boundary]) -> np.ndarray:
+    """Whether positions (..., D) are beyond walls, (...) bool."""
+    lower, upper = np.asarray(domain, dtype=np.float32).T
+    outside: np.ndarray = (((position < lower) | (position > upper)) & [kind == "wall" for kind in boundary]).any(-1)
+    return outside
+
+
 def first_outside(
     position: np.ndarray, domain: Sequence[Interval], boundary: Sequence[Boundary], counted: np.ndarray | bool = True
 ) -> tuple[int, int, int] | None:
@@ -183,9 +190,7 @@ def first_outside(
 
     Outside are positions beyond walls. Only particles that are `counted`, (N,), are compared.
     """
-    lower, upper = np.asarray(domain, dtype=np.float32).T
-    walls = [kind == "wall" for kind in boundary]
-    outside = (((position < lower) | (position > upper)) & walls).any(axis=-1) & counted
+    outside = are_outside(position, domain, boundary) & counted
     if not outside.any():
         return None
     frame, particle = map(int, np.argwhere(outside)[0])

@@ -98,6 +98,17 @@ def test_a_rollout_makes_frames_between_those_of_the_data_or_jumps_over_some(cap
     assert len(jumped.position) == 16
 
 
+def test_walls_of_particles_may_be_thicker_than_the_model_s(capsys):
+    """Those beyond its grid are left out there, not in what is written."""
+    data = write_foreign(domain=((-500.0, 2000.0),) * 2)
+    run = Split(data / "test.h5").read(0)
+    run.position[:, run.particle_type == 3] = [-400.0, 600.0]
+    write_split(data / "test.h5", [run])
+    with pytest.warns(UserWarning, match=r"4 obstacle particles beyond the grid's walls are left out"):
+        assert main(["rollout", "goop", "--data", str(data)]) == 0
+    assert Split(Path("out.h5")).read(0).position.shape[1] == 13
+
+
 def test_strict_refuses_what_does_not_match(capsys):
     data = write_foreign(gravity=(0.0, 9.81e-3))
     words = ["rollout", "goop", "--data", str(data)]

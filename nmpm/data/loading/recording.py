@@ -25,7 +25,7 @@ from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.loading.presence import Presence, find_tracks, obstacle_frames
 from nmpm.data.split_files import split_paths
-from nmpm.data.statistics import first_moving_particle, first_outside, without_those_gone
+from nmpm.data.statistics import are_outside, first_moving_particle, first_outside, without_those_gone
 from nmpm.data.times import check_times
 from nmpm.data.volumes import check_positive, mean_volume, stated_volumes, volumes
 from nmpm.errors import DataError
@@ -119,12 +119,18 @@ class RecordingReader:
 
         Returns:
             (N,) whether each particle moves and is predicted, and whether it is an obstacle.
+
+        Warns:
+            UserWarning: if particles at rest lie beyond the walls of the domain, and are no obstacles on its grid.
         """
         types = trajectory.particle_type
         self.metadata.check_types(types, where)
         moving = self.metadata.is_moving(types)
-        obstacle = self.metadata.is_obstacle(types)
         position = without_those_gone(trajectory.position, self.scene)
+        beyond = self.metadata.is_static(types) & are_outside(position[0], self.scene.domain, self.scene.boundary)
+        if beyond.any():
+            warnings.warn(f"{beyond.sum()} obstacle particles beyond the grid's walls are left out.", stacklevel=2)
+        obstacle = self.metadata.is_obstacle(types) & ~beyond
         if outside := first_outside(position, self.scene.domain, self.scene.boundary, moving | obstacle):
             frame, particle, number = outside
             raise DataError(
