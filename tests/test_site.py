@@ -89,6 +89,16 @@ def test_the_site_builds_and_fetches_nothing(tmp_path):
     assert "```math" not in concepts
 
 
+def test_what_runs_where_is_the_table_of_the_engines():
+    from nmpm.emulator.engines import rules
+
+    page = load_hook("pages").engines_page()
+    for rule in (*rules.MODELS, *rules.CALLS):
+        marks = " | ".join("✓" if name in rule.engines else "" for name in rules.FASTER)
+        assert f"| {rule.feature} | {marks} |" in page
+    assert all(f"- {rule.feature}" in page for rule in rules.RECORDINGS)
+
+
 def test_help_does_not_depend_on_the_terminal(monkeypatch):
     pages = load_hook("pages")
     written = []

@@ -1,7 +1,8 @@
 """MkDocs hook: pages that are not written in `docs/`, but made of other files of the repository at each build.
 
 Included as they are: the root's Markdown files, README.md as the start page, and those of `benchmarks/` and `zoo/` with
-their pictures. Generated: help of all commands, the explained configuration, and a page for each room of the package.
+their pictures. Generated: help of all commands, the explained configuration, what runs where by the tables of engines, and a page for
+each room of the package.
 """
 
 from __future__ import annotations
@@ -9,13 +10,16 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from nmpm.cli import COMMANDS, main, usage
+from nmpm.emulator.engines import rules
 
 ROOT = Path(__file__).parents[2]
 INCLUDED = ("[A-Z]*.md", "benchmarks/**/*.md", "zoo/**/*.md", "notebooks/*.ipynb")
@@ -57,7 +61,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def generated_pages() -> dict[str, str]:
     """Markdown by path within the site."""
-    pages = {"reference/commands.md": commands_page(), "reference/configuration.md": configuration_page()}
+    pages = {
+        "reference/commands.md": commands_page(),
+        "reference/configuration.md": configuration_page(),
+        "what_runs_where.md": engines_page(),
+    }
     return pages | {f"reference/{room}.md": room_page(room) for room in ROOMS}
 
 
@@ -93,6 +101,37 @@ def configuration_page() -> str:
         " part.\n\n"
         f"Shipped: {names}. This is `tutorial.yaml`:\n\n```yaml\n{explained}```\n"
     )
+
+
+def engines_page() -> str:
+    """What runs where, by the tables of `nmpm.emulator.engines.rules`."""
+    tried = "\n".join(f"| {name} | {where} |" for name, where in rules.TRIED.items())
+    refusals = "\n".join(f"- {rule.feature}" for rule in rules.RECORDINGS)
+    return (
+        "# What runs where\n\n"
+        "A call of a model is computed by an *engine*: torch's operations, which take everything, or kernels that are"
+        " faster and take what is marked here. Everything that a model and its call have must be marked: else the call"
+        " is torch's, with the same result to rounding. The *network* between is run by torch, or by a *runtime* that"
+        " is asked for (`model.optimized()`, `--runtime`). `model.explain()` and `nmpm zoo card NAME` say what this"
+        " means for a model here.\n\n"
+        f"## Engines: models\n\n{_table(rules.MODELS, rules.FASTER)}\n\n"
+        f"## Engines: calls\n\n{_table(rules.CALLS, rules.FASTER)}\n\n"
+        "## CUDA graphs\n\n"
+        "On a CUDA GPU rollouts' calls are recorded when a shape of state comes again, and replayed from then on."
+        f" Not recorded are shapes that change with each call, and:\n\n{refusals}\n\n"
+        f"## Runtimes\n\nWithout gradients alone.\n\n{_table(rules.RUNTIMES, ('openvino', 'windows'))}\n\n"
+        f"## Exported files\n\n{_table(rules.EXPORTS, ('step', 'network', 'solid'))}\n\n"
+        "## Errors of trainings\n\n"
+        f"Kernels compute them but for:\n\n{chr(10).join(f'- {rule.feature}' for rule in rules.TRAINING_ERRORS)}\n\n"
+        f"## Where this has run\n\n| | on |\n|---|---|\n{tried}\n"
+    )
+
+
+def _table(rows: Sequence[rules.Rule[Any]], columns: Sequence[str]) -> str:
+    """Features, and a mark for each column that takes them."""
+    lines = [["feature", *columns], ["---", *([":-:"] * len(columns))]]
+    lines += [[rule.feature, *("✓" if name in rule.engines else "" for name in columns)] for rule in rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 def room_page(room: str) -> str:

@@ -121,6 +121,7 @@ def _card(options: argparse.Namespace) -> None:
         return
     with complete_card(options.name):
         text = entry_page(card)
+    text = f"{text.rstrip()}\n\n## What runs here\n\n```text\n{_explain(options.name, options.root)}\n```\n"
     if not sys.stdout.isatty():
         sys.stdout.write(text)
         return
@@ -128,6 +129,17 @@ def _card(options: argparse.Namespace) -> None:
     from rich.markdown import Markdown
 
     Console().print(Markdown(text))
+
+
+def _explain(name: str, root: Path | None) -> str:
+    """What computes a model on this machine's CPU; why it cannot be loaded, if so."""
+    from nmpm.errors import NmpmError
+    from nmpm.zoo.registry import load_model
+
+    try:
+        return load_model(name, root=root).emulator.explain()
+    except NmpmError as error:
+        return f"The model cannot be loaded: {error}"
 
 
 def _add(options: argparse.Namespace) -> None:

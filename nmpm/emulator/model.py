@@ -31,6 +31,7 @@ from nmpm.emulator.fields import FieldScales
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
 from nmpm.errors import ConfigError
+from nmpm.grid import Grid
 from nmpm.particles import Particles
 from nmpm.processors import GridLayout, GridProcessor
 from nmpm.scene import Scene
@@ -60,6 +61,8 @@ class Emulator(nn.Module):
         thread_choice: Sets torch's number of threads for each call; None to leave it alone.
     """
 
+    grid: Grid
+    processor: GridProcessor
     input_mean: Tensor
     input_std: Tensor
     input_low: Tensor
@@ -161,7 +164,7 @@ class Emulator(nn.Module):
         other = copy.copy(self)
         other.runtime = find_runtime(runtime) if isinstance(runtime, str) else runtime
         if reason := other.runtime.unsupported_reason(self):
-            raise ConfigError(reason)
+            raise ConfigError(f"The runtime {other.runtime.name} does not run {reason}.")
         return other
 
     def with_constraints(self, constraints: Constraints) -> Emulator:
@@ -212,6 +215,12 @@ class Emulator(nn.Module):
         from nmpm.emulator.adaptation import adapted  # imported late, as it imports this module
 
         return adapted(self, match.recipe)
+
+    def explain(self) -> str:
+        """Lines on what computes rollouts and trainings on this device, and why nothing faster does."""
+        from nmpm.emulator.engines.explanation import explain
+
+        return "\n".join(explain(self))
 
     def context(self, particles: Particles) -> RolloutContext:
         """The context of a rollout from this state; warns of fields that the state lacks."""

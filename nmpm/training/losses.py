@@ -14,13 +14,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nmpm.emulator.engines.rules import TRAINING_ERRORS, Comparison, takes
 from nmpm.emulator.prescribed import predicted_particles
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.particles import Window, scene_volumes
 from nmpm.scene import Scene
 from nmpm.transfer import Linear
-from nmpm.transfer.execution import kernels_take
 
 _FLOOR = 1e-4
 """Cells², added to errors before they are raised to a power: below a hundredth of a cell errors no longer count."""
@@ -152,7 +152,7 @@ def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) 
 def position_errors(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid, frames: int) -> Tensor:
     """`position_error` of each of B windows and of each bundle of `frames` frames, (B, T / frames)."""
     check_comparable(predicted, target, frames)  # (kernels check no bounds)
-    if _kernels_support(predicted, target, grid):
+    if takes("numba", TRAINING_ERRORS, Comparison(predicted, target, grid)):
         from nmpm.training.kernels import PositionErrors
 
         errors: Tensor = PositionErrors.apply(predicted, target, mask, grid, frames)  # type: ignore[no-untyped-call]
@@ -198,7 +198,7 @@ def density_error(
     """
     fraction = scene.particle_volume / grid.cell_volume
     cells = (grid.to_cells(frames, frames.dtype) for frames in (predicted, target))
-    kernels = there is None and _kernels_support(predicted, target, grid)
+    kernels = there is None and takes("numba", TRAINING_ERRORS, Comparison(predicted, target, grid))
     if kernels and (sizes := scene_volumes(window.volume, window.mask)) is not None:
         scale = fraction * sizes.view(-1, 1, 1, 1)
         predicted_fraction, true_fraction = (scale * _kernel_counts(of, window, scene, grid) for of in cells)
@@ -225,9 +225,3 @@ def _kernel_counts(cells: Tensor, window: Window, scene: Scene, grid: Grid) -> T
 
     counts: Tensor = Counts.apply(cells, window.material, window.mask, grid, len(scene.materials))  # type: ignore[no-untyped-call]
     return counts
-
-
-def _kernels_support(predicted: Tensor, target: Tensor, grid: Grid) -> bool:
-    """Whether the kernels can compute the error: with gradients with respect to the prediction alone."""
-    fixed = not target.requires_grad and not torch.compiler.is_compiling()
-    return fixed and grid.dim == 2 and kernels_take(predicted, target)

@@ -161,7 +161,6 @@ def _arguments(
     batch = window.map(lambda _: next(values))
     placed = copy.copy(emulator)
     placed.grid = _PlacedGrid(**vars(emulator.grid), shift=shift)
-    placed.engines = ()  # kernels would take the grid's place from the recipe
     placed._buffers = {**emulator._buffers, "bounds": bounds, "walls": walls}
     return batch, lambda: batch.initial.with_motion(position, batch.initial.velocity), placed
 

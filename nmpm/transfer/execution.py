@@ -118,11 +118,6 @@ def kernels_are_on() -> bool:
     return _kernels.get()
 
 
-def kernels_take(*values: Tensor) -> bool:
-    """Whether fused kernels can take these tensors: float32 on a CPU, outside of `without_kernels`."""
-    return kernels_are_on() and all(each.device.type == "cpu" and each.dtype == torch.float32 for each in values)
-
-
 def add(source: Tensor, index: Tensor, size: int) -> Tensor:
     """Sum values (B, L, C) into places (B, L) from 0 to size - 1, (B, size, C)."""
     fallback = in_order if source.is_cuda and torch.are_deterministic_algorithms_enabled() else native

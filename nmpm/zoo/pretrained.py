@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -254,6 +255,10 @@ class Pretrained:
             return model.example(count=fitting_count(model, _EXAMPLE)).to(model.emulator.device)
 
         return dataclasses.replace(model, emulator=optimize(model.emulator, runtime, make_example))
+
+    def explain(self) -> None:
+        """Print what computes rollouts and trainings on the model's device, and why nothing faster does."""
+        sys.stdout.write(f"{self.emulator.explain()}\n")
 
     def to(self, device: torch.device | str) -> Pretrained:
         """The model on another device: "cpu", "cuda", "cuda:1", "mps", or "auto" for a GPU where there is one.

@@ -292,7 +292,7 @@ def test_what_has_no_kernels_or_programs_is_refused_with_the_reason():
     assert opened.engines
     assert not emulator_of(box(**OPEN), rest_speed=0.1).engines
     for emulator, what in ((moving, "obstacles that move"), (opened, "open axes")):
-        with pytest.raises(ConfigError, match=f"scenes have {what}, which exported files do not carry"):
+        with pytest.raises(ConfigError, match=f"exported files do not carry: {what}: use it in Python"):
             Network(emulator)
 
 

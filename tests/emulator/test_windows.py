@@ -119,7 +119,7 @@ def test_the_whole_grid_is_computed_where_windows_do_not_pay():
 
 
 def test_what_windows_cannot_do_is_refused():
-    with pytest.raises(ConfigError, match="Axial may see all of it: use eager"):
+    with pytest.raises(ConfigError, match="networks that may see the whole grid, of no known radius: use eager"):
         large(box(), processor=Axial(width=8, layers=1, heads=2)).with_runtime("windows")
     with pytest.raises(ConfigError, match="no gradients"):
         large(box()).requires_grad_(True).with_runtime("windows")(drops(box()))

@@ -1,4 +1,4 @@
-"""Engines: what computes an emulator's calls, but for the network. `rules` says which of them a call takes."""
+"""Engines: what computes an emulator's calls, but for the network. `rules` says which of them takes a call."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 from torch import Tensor
 
-from nmpm.emulator.engines.rules import Call, is_recordable
+from nmpm.emulator.engines.rules import RECORDINGS, Call, takes
 from nmpm.emulator.runtimes.programs import MOST, Programs
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class RecordedCalls:
 
     def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
         """The emulator's bundle, recorded if this call can be."""
-        if self._failed or not is_recordable(Call(emulator, particles, context.solid)):
+        if self._failed or not takes("graph", RECORDINGS, Call(emulator, particles, context.solid)):
             return emulator.runtime.bundle(emulator, particles, context)
         inputs = _inputs(particles, context)
         recording = self._find(emulator, particles, context, _key(particles, inputs))

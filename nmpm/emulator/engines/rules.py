@@ -1,20 +1,23 @@
-"""What runs where: which engine computes which feature of a model, and of a call.
+"""What runs where: tables of the features that engines, recordings, runtimes and exported files take.
 
-The torch engine computes everything; the others are faster, and compute what the tables give to them.
+The torch engine computes everything, and the runtime eager every network; the others are faster, and take what the
+tables give to them. `Emulator.explain` and the documentation's page "What runs where" are made of these tables.
 """
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
+from nmpm.grid import Grid
 from nmpm.particles import Particles, scene_volumes
 from nmpm.transfer import Linear, Nearest, Quadratic
 from nmpm.transfer.execution import is_default, kernels_are_on
@@ -31,11 +34,25 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Rule(Generic[T]):
-    """A feature, the engines beside torch's that compute it, and whether a model, or a call, has it."""
+    """A feature, who takes it beside torch, whether a model or call has it, and what to do where it is not taken."""
 
     feature: str
     engines: tuple[str, ...]
     holds: Callable[[T], bool]
+    mend: str = ""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Predicted and true positions on a grid, for the errors of `nmpm.training.losses`."""
+
+    predicted: Tensor
+    target: Tensor
+    grid: Grid
+
+    @property
+    def is_on_cpu(self) -> bool:
+        return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in (self.predicted, self.target))
 
 
 @dataclass(frozen=True)
@@ -125,6 +142,7 @@ CALLS: tuple[Rule[Call], ...] = (
         "gradients of a rollout", ("numba training",),
         lambda call: _need_gradients((*call.motion, *call.emulator.parameters())),
     ),
+    Rule("a recorded training step, which moves its grid", (), lambda call: type(call.emulator.grid) is not Grid),
     Rule("graphs that torch.compile traces", (), lambda _: torch.compiler.is_compiling()),
     Rule("nmpm.transfer.without_kernels", (), lambda _: not kernels_are_on()),
     Rule(
@@ -150,15 +168,71 @@ RECORDINGS: tuple[Rule[Call], ...] = (
 )
 """What calls that are recorded as CUDA graphs cannot have, whichever engine computes them."""
 
+RUNTIMES: tuple[Rule[Emulator], ...] = (
+    Rule(
+        "machines without OpenVINO", ("windows",), lambda _: importlib.util.find_spec("openvino") is None,
+        'pip install "nmpm[openvino]"',
+    ),
+    Rule(
+        "models on other devices than a CPU", ("windows",), lambda model: model.device.type != "cpu",
+        "move it to the CPU, or use eager",
+    ),
+    Rule(
+        "networks in other precisions than float32 and bfloat16", ("windows",),
+        lambda model: model.network_precision not in (torch.float32, torch.bfloat16), "use eager",
+    ),
+    Rule(
+        "networks that may see the whole grid, of no known radius", ("openvino",),
+        lambda model: getattr(model.processor, "radius", None) is None, "use eager",
+    ),
+)  # fmt: skip
+"""What the runtimes beside eager run: all of them without gradients alone."""
 
-def is_recordable(call: Call) -> bool:
-    """Whether a call can be recorded as a CUDA graph."""
-    return not any(rule.holds(call) for rule in RECORDINGS)
+_FREE = "export with --free, or use `emulator.unconstrained()`"
+EXPORTS: tuple[Rule[Emulator], ...] = (
+    Rule("fields", (), lambda m: bool(m.scene.fields), "use it in Python, or train one with data.fields=[]"),
+    Rule("obstacles that move", (), lambda model: model.scene.moving_obstacles, "use it in Python"),
+    Rule("open axes", (), lambda model: "open" in model.scene.boundary, "use it in Python"),
+    # In as many pieces as the fastest particle needs, while a program has a fixed number.
+    Rule(
+        "contact with obstacles (constraints.solids)", ("network", "solid"),
+        lambda model: model.constraints.solids and model.scene.obstacles, _FREE,
+    ),
+    Rule("bounds: error", ("network", "solid"), lambda model: model.constraints.bounds == "error", _FREE),
+)  # fmt: skip
+"""What exported files of a call ("step"), the network alone and the obstacles' cells ("solid") carry."""
+
+TRAINING_ERRORS: tuple[Rule[Comparison], ...] = (
+    Rule("one and three dimensions", (), lambda pair: pair.grid.dim != 2),
+    Rule("other devices than a CPU, and float64", (), lambda pair: not pair.is_on_cpu),
+    Rule("gradients of the true positions", (), lambda pair: pair.target.requires_grad),
+    Rule("graphs that torch.compile traces", (), lambda _: torch.compiler.is_compiling()),
+    Rule("nmpm.transfer.without_kernels", (), lambda _: not kernels_are_on()),
+)
+"""What the kernels of a training's position and density errors do not compute."""
+
+TRIED: Mapping[str, str] = MappingProxyType(
+    {
+        "torch": "every test, on CPUs; an NVIDIA H200 (torch 2.11, November 2026)",
+        "numba": "every test, on CPUs",
+        "numba training": "every test, on CPUs",
+        "triton": "Triton's interpreter on CPUs; no GPU yet, so that the first call compares a bundle with torch",
+        "CUDA graphs": "tests with a stand-in; an NVIDIA H200 (torch engine, without fields, November 2026)",
+        "openvino": "tests on CPUs",
+        "windows": "tests on CPUs",
+    }
+)
+"""Where engines, recordings and runtimes have run."""
 
 
 def model_engines(recipe: EmulatorRecipe) -> tuple[str, ...]:
     """Those of `FASTER` that compute all that a model has."""
-    return tuple(name for name in FASTER if not lacks(name, MODELS, recipe))
+    return tuple(name for name in FASTER if takes(name, MODELS, recipe))
+
+
+def takes(engine: str, rules: Iterable[Rule[T]], subject: T) -> bool:
+    """Whether an engine computes all that a model or a call has."""
+    return not any(engine not in rule.engines and rule.holds(subject) for rule in rules)
 
 
 def lacks(engine: str, rules: Iterable[Rule[T]], subject: T) -> list[str]:
@@ -166,12 +240,13 @@ def lacks(engine: str, rules: Iterable[Rule[T]], subject: T) -> list[str]:
     return [rule.feature for rule in rules if engine not in rule.engines and rule.holds(subject)]
 
 
+def refusal(engine: str, rules: Iterable[Rule[T]], subject: T) -> str:
+    """The first feature that an engine does not take, and what to do; empty if there is none."""
+    rule = next((rule for rule in rules if engine not in rule.engines and rule.holds(subject)), None)
+    return "" if rule is None else f"{rule.feature}: {rule.mend}"
+
+
 def call_engine(emulator: Emulator, particles: Particles, solid: Tensor) -> str:
     """The name of the engine that computes a call."""
-    fitting, call = emulator.engines, Call(emulator, particles, solid)
-    for rule in CALLS:
-        if not fitting:
-            return "torch"
-        if any(name not in rule.engines for name in fitting) and rule.holds(call):
-            fitting = tuple(name for name in fitting if name in rule.engines)
-    return fitting[0] if fitting else "torch"
+    call = Call(emulator, particles, solid)
+    return next((name for name in emulator.engines if takes(name, CALLS, call)), "torch")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import ctypes
-import importlib.util
 import sys
 import warnings
 from collections.abc import Iterator
@@ -21,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from nmpm._support.messages import one_line
+from nmpm.emulator.engines.rules import RUNTIMES, refusal
 from nmpm.emulator.runtimes.programs import Programs
 from nmpm.emulator.runtimes.runtime import Runtime, refuse_gradients
 from nmpm.errors import ConfigError
@@ -42,13 +42,7 @@ class OpenVINO(Runtime):
         self._programs: Programs[_Program] = Programs()
 
     def unsupported_reason(self, emulator: Emulator) -> str:
-        if importlib.util.find_spec("openvino") is None:
-            return _INSTALL
-        if emulator.device.type != "cpu":
-            return f"The runtime openvino runs on CPUs; the model is on {emulator.device}."
-        if emulator.network_precision not in _HINTS:
-            return f"The runtime openvino computes in float32 or bfloat16, not in {emulator.network_precision}."
-        return ""
+        return refusal(self.name, RUNTIMES, emulator)
 
     def fields(self, network: GridProcessor, grid: Tensor, precision: torch.dtype) -> Tensor:
         refuse_gradients(self, network, grid)

@@ -36,7 +36,7 @@ class Runtime(ABC):
     """Whether CUDA graphs can hold calls in which it computes the network."""
 
     def unsupported_reason(self, emulator: Emulator) -> str:  # noqa: ARG002 (none unless overridden)
-        """Why this runtime cannot run the emulator here, with the mend; empty if nothing is known to prevent it."""
+        """The feature of the emulator that this runtime does not run here, with the mend; empty for none."""
         return ""
 
     @abstractmethod

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nmpm.emulator.engines.rules import RUNTIMES, refusal
 from nmpm.emulator.runtimes.grid_crops import BLOCK, CALL_CELLS, Axis, Blocks, GridCrop, cover_blocks, predict_on_crops
 from nmpm.emulator.runtimes.runtime import Eager, Runtime, refuse_gradients
 from nmpm.errors import ConfigError
@@ -52,12 +53,7 @@ class Windows(Runtime):
         self._most = most_cells or sys.maxsize
 
     def unsupported_reason(self, emulator: Emulator) -> str:
-        if getattr(emulator.processor, "radius", None) is None:
-            return (
-                f"The runtime windows needs a network that sees a part of the grid, of known radius;"
-                f" {type(emulator.recipe.processor).__name__} may see all of it: use eager."
-            )
-        return ""
+        return refusal(self.name, RUNTIMES, emulator)
 
     def fields(self, network: GridProcessor, grid: Tensor, precision: torch.dtype) -> Tensor:
         return Eager().fields(network, grid, precision)

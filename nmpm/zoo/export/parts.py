@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from nmpm.emulator import Emulator, RolloutContext
+from nmpm.emulator.engines.rules import EXPORTS, refusal
 from nmpm.emulator.rasterise import wall_fraction
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
@@ -47,7 +48,7 @@ class Part(nn.Module, ABC):
         emulator: On any device; it is left there.
 
     Raises:
-        ConfigError: if the emulator has fields beside motion, obstacles that move, or open axes.
+        ConfigError: if the emulator has what the part does not carry, see `nmpm.emulator.engines.rules`.
     """
 
     inputs: tuple[Value, ...]
@@ -55,14 +56,8 @@ class Part(nn.Module, ABC):
 
     def __init__(self, emulator: Emulator) -> None:
         super().__init__()
-        if emulator.scene.fields:
-            raise ConfigError(
-                f"The model has fields beside motion ({', '.join(emulator.scene.fields)}), which exported files do not"
-                " carry: use the model in Python, or train one without them (data.fields=[])."
-            )
-        if not emulator.scene.is_closed:
-            what = "obstacles that move" if emulator.scene.moving_obstacles else "open axes"
-            raise ConfigError(f"The model's scenes have {what}, which exported files do not carry: use it in Python.")
+        if reason := refusal(type(self).__name__.lower(), EXPORTS, emulator):
+            raise ConfigError(f"The model has what exported files do not carry: {reason}.")
         self.emulator = copy.deepcopy(emulator.with_runtime("eager")).cpu().float().eval().requires_grad_(False)
 
     @property
@@ -85,7 +80,6 @@ class Step(Part):
 
     def __init__(self, emulator: Emulator) -> None:
         super().__init__(emulator)
-        _check_constraints(emulator)
         scene, shape = emulator.scene, emulator.grid.shape
         state: tuple[str | int, ...] = ("B", "N", scene.dim)
         names = ", ".join(f"{index} {name}" for index, name in enumerate(scene.materials))
@@ -223,18 +217,3 @@ def _real_state(position: Tensor, velocity: Tensor, material: Tensor, obstacle: 
         torch.ones(points.shape[:2], dtype=torch.bool, device=points.device) for points in (position, obstacle)
     )
     return Particles(position, velocity, material, mask, obstacle, obstacle_mask, gravity)
-
-
-def _check_constraints(emulator: Emulator) -> None:
-    constraints = emulator.constraints
-    if constraints.solids and emulator.scene.obstacles:
-        raise ConfigError(
-            "constraints.solids cannot be exported: contact with obstacles splits paths into as many pieces as the"
-            " fastest particle needs, and a program has a fixed number. Export with --free, or in Python"
-            " `emulator.with_constraints(nmpm.emulator.constraints.Constraints(solids=False))`."
-        )
-    if constraints.bounds == "error":
-        raise ConfigError(
-            "constraints.bounds = error cannot be exported, as a program cannot raise errors: export with --free, or"
-            " train with stop or reflect."
-        )

@@ -1,0 +1,125 @@
+"""The tables of what runs where hold: calls with each feature take, or do not take, each engine."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from nmpm.decoders import Residual
+from nmpm.emulator.engines import rules
+from nmpm.emulator.engines.rules import CALLS, EXPORTS, FASTER, MODELS, RUNTIMES, Call, call_engine, takes
+from nmpm.grid import Grid
+from nmpm.processors import FNO
+from nmpm.transfer import Affine, Quadratic
+from tests.scenes import box, cloud, emulator_of
+
+OPEN = {"boundary": ("open", "wall")}
+FAR = {"bounds": ((1e6, 1e6 + 0.8), (0.1, 0.9)), "domain": ((1e6 - 0.02, 1e6 + 0.82), (0.08, 0.92))}
+
+
+class OwnDecoder(Residual):
+    """Of another package."""
+
+
+class MovedGrid(Grid):
+    """Of a recorded training step."""
+
+
+WITH_FEATURE = {
+    "one dimension": lambda: emulator_of(box(1)),
+    "three dimensions": lambda: emulator_of(box(3), 8),
+    "fields": lambda: emulator_of(box(evolving=("heat",))),
+    "obstacles that move": lambda: emulator_of(box(obstacles=True, moving_obstacles=True)),
+    "rest beside open axes": lambda: emulator_of(box(**OPEN), rest_speed=0.1),
+    "the transfers Nearest and Quadratic": lambda: emulator_of(box(), transfer=Quadratic()),
+    "other transfers": lambda: emulator_of(box(), transfer=Affine()),
+    "another package's decoder": lambda: emulator_of(box(), decoder=OwnDecoder()),
+    "bounds: reflect": lambda: emulator_of(box(), bounds="reflect"),
+    "bounds: error": lambda: emulator_of(box(), bounds="error"),
+    "a domain too far from the origin for float32": lambda: emulator_of(box(**FAR)),
+}
+"""An emulator of each feature of `MODELS`."""
+
+
+def changed(state, **changes):
+    return dataclasses.replace(state, **changes)
+
+
+CHANGES = {
+    "a CPU": lambda patch, _, state: patch.setattr(Call, "device", "cpu"),
+    "a CUDA GPU": lambda patch, _, state: patch.setattr(Call, "device", "cuda"),
+    "other devices": lambda patch, _, state: patch.setattr(Call, "device", "mps"),
+    "machines without Triton": lambda patch, _, state: patch.setattr(rules, "_has_triton", lambda: False),
+    "rollouts": lambda _, emulator, state: emulator.eval() and None,
+    "trainings": lambda _, emulator, state: emulator.train() and None,
+    "float64": lambda *_: _[-1].double(),
+    "moving obstacles in the state": lambda *_: changed(_[-1], obstacle_velocity=torch.zeros_like(_[-1].obstacle)),
+    "sizes of particles": lambda *_: changed(_[-1], volume=2 * torch.ones(_[-1].mask.shape)),
+    "several sizes in a scene": lambda *_: changed(_[-1], volume=1 + torch.rand(_[-1].mask.shape)),
+    "gradients of gravity or obstacles": lambda *_: changed(_[-1], gravity=_[-1].gravity.clone().requires_grad_()),
+    "gradients of a rollout": lambda *_: changed(_[-1], velocity=_[-1].velocity.clone().requires_grad_()),
+    "a recorded training step, which moves its grid": lambda _, emulator, state: setattr(
+        emulator, "grid", MovedGrid(**vars(emulator.grid))
+    ),
+    "graphs that torch.compile traces": lambda patch, *_: patch.setattr(torch.compiler, "is_compiling", lambda: True),
+    "nmpm.transfer.without_kernels": lambda patch, *_: patch.setattr(rules, "kernels_are_on", lambda: False),
+    "deterministic algorithms": lambda patch, *_: patch.setattr(
+        torch, "are_deterministic_algorithms_enabled", lambda: True
+    ),
+}
+"""Changes of a call, its emulator or its state, that give it each feature of `CALLS`."""
+
+
+def takes_engine(engine: str, emulator, state, change, monkeypatch) -> bool:
+    """Whether a call that would otherwise be the engine's is, after a change."""
+    emulator = emulator.train("training" in engine).requires_grad_("training" in engine)
+    monkeypatch.setattr(Call, "device", "cuda" if "triton" in engine else "cpu")
+    monkeypatch.setattr(rules, "_has_triton", lambda: True)
+    solid = emulator.solid(state)
+    state = change(monkeypatch, emulator, state) or state
+    return call_engine(emulator, state, solid) == engine
+
+
+@pytest.mark.parametrize("engine", FASTER)
+@pytest.mark.parametrize("rule", MODELS, ids=lambda rule: rule.feature)
+def test_a_model_with_a_feature_takes_the_engines_of_its_row(rule, engine, monkeypatch):
+    emulator = WITH_FEATURE[rule.feature]()
+    state = cloud(emulator.scene)
+    state = state.with_fields({name: torch.zeros(1, 30) for name in emulator.scene.fields})
+    assert rule.holds(emulator.recipe)
+    assert takes_engine(engine, emulator, state, lambda *_: None, monkeypatch) == (engine in rule.engines)
+
+
+@pytest.mark.parametrize("engine", FASTER)
+@pytest.mark.parametrize("rule", CALLS, ids=lambda rule: rule.feature)
+def test_a_call_with_a_feature_takes_the_engines_of_its_row(rule, engine, monkeypatch):
+    emulator = emulator_of(box())
+    taken = takes_engine(engine, emulator, cloud(box()), CHANGES[rule.feature], monkeypatch)
+    assert taken == (engine in rule.engines)
+
+
+@pytest.mark.parametrize("engine", FASTER)
+def test_a_plain_call_takes_each_engine(engine, monkeypatch):
+    assert takes_engine(engine, emulator_of(box()), cloud(box()), lambda *_: None, monkeypatch)
+
+
+def test_runtimes_and_exports_take_plain_models_and_not_those_of_their_rows():
+    plain = emulator_of(box())
+    assert takes("windows", RUNTIMES, plain)
+    assert takes("step", EXPORTS, plain)
+    assert not takes("windows", RUNTIMES, emulator_of(box(), processor=FNO(width=4, layers=1, modes=2)))
+    for feature in ("fields", "obstacles that move", "bounds: error"):
+        assert not takes("step", EXPORTS, WITH_FEATURE[feature]())
+    assert takes("network", EXPORTS, WITH_FEATURE["bounds: error"]())
+
+
+def test_an_emulator_explains_what_runs_and_why_nothing_faster_does(monkeypatch):
+    plain, heat = emulator_of(box()), emulator_of(box(evolving=("heat",)))
+    lines = plain.explain().splitlines()
+    assert lines[:3] == ["On cpu:", "  rollouts   Numba kernels", "  trainings  Numba kernels with gradients"]
+    assert lines[4] == "  recorded   no CUDA graphs: devices other than a CUDA GPU"
+    monkeypatch.setattr(Call, "device", "cuda")
+    on_gpu = heat.explain()
+    assert "recorded   as CUDA graphs" in on_gpu
+    three = emulator_of(box(3), 8).explain()
+    assert "trainings  torch's operations; Numba kernels with gradients do not take three dimensions" in three
