@@ -1,8 +1,8 @@
 """MkDocs hook: pages that are not written in `docs/`, but made of other files of the repository at each build.
 
 Included as they are: the root's Markdown files, README.md as the start page, and those of `benchmarks/` and `zoo/` with
-their pictures. Generated: help of all commands, the explained configuration, what runs where by the tables of engines, and a page for
-each room of the package.
+their pictures. Generated: help of all commands, the explained configuration, what runs where by the tables of engines,
+and a page for each room of the package.
 """
 
 from __future__ import annotations
