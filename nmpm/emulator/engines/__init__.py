@@ -43,7 +43,19 @@ def _triton(emulator: Emulator) -> Engine[Any, Any]:
     return TritonEngine(emulator, emulator.kernel_parameters)
 
 
+def _triton_training(emulator: Emulator) -> Engine[Any, Any]:
+    from nmpm.emulator.engines.triton.training import TritonTraining
+
+    return TritonTraining(emulator, emulator.kernel_parameters)
+
+
 ENGINES: Mapping[str, Callable[[Emulator], Engine[Any, Any]]] = MappingProxyType(
-    {"torch": TorchEngine, "numba": _numba, "numba training": _numba_training, "triton": _triton}
+    {
+        "torch": TorchEngine,
+        "numba": _numba,
+        "numba training": _numba_training,
+        "triton": _triton,
+        "triton training": _triton_training,
+    }
 )
 """How engines are made for an emulator, by name."""

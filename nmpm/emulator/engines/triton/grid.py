@@ -8,6 +8,9 @@ kernel is compiled: which axes wrap, the number of materials, what a model has.
 import triton
 import triton.language as tl
 
+LEAST = tl.constexpr(1e-30)
+"""Of a particle: where a node sees less, gradients of its means would overflow."""
+
 SIZES = (
     "nx", "ny", "size", "count", "tiles", "entries", "frame", "frames", "channels", "outputs", "per_scene", "per_frame",
     "per_channel", "per_row", "per_column", "per_end", "per_axis", "apart",
@@ -135,7 +138,7 @@ def fill_state(sums, solid, per_scene, walls, gravity, low, high, mean, deviatio
     row, total = cell * channels, sums + cell * (3 * MATERIALS)
     for kind in tl.static_range(MATERIALS):
         count = tl.load(total + 2 * MATERIALS + kind, mask=active, other=0.0)
-        divisor = tl.where(count > 0, count, 1.0)
+        divisor = tl.where(count > LEAST, count, 1.0)
         for axis in tl.static_range(2):
             value = tl.load(total + 2 * kind + axis, mask=active, other=0.0) / divisor
             _fill(state, seen, low, high, mean, deviation, row, 2 * kind + axis, value, active, SEEN)

@@ -34,13 +34,13 @@ def warps(block: int) -> int:
     return min(max(block // 128, 4), 16)
 
 
-def axes(shape: tuple[int, ...], wraps: tuple[bool, ...]) -> dict[str, int]:
+def axes(shape: Sequence[int], wraps: Sequence[bool]) -> dict[str, int]:
     """What kernels are told of a grid in 2-D."""
     (nx, ny), (wx, wy) = shape, wraps
     return {"nx": nx, "ny": ny, "WX": int(wx), "WY": int(wy)}
 
 
-def walls(confined: tuple[bool, ...]) -> dict[str, bool]:
+def walls(confined: Sequence[bool]) -> dict[str, bool]:
     """What kernels are told of the axes that walls confine."""
     return {"WALLS_X": confined[0], "WALLS_Y": confined[1]}
 
