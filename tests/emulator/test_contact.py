@@ -1,4 +1,4 @@
-"""Particles do not enter obstacles: closed forms, the two forms beside each other, a rollout."""
+"""Particles do not enter obstacles: closed forms, a rollout."""
 
 import pytest
 import torch
@@ -89,50 +89,58 @@ def test_nobody_gets_through_one_cell_however_it_lies_and_however_fast(speed, an
     assert (held[..., 1] > 8 + offset).all()
 
 
+@pytest.fixture(params=["values are read", "no values are read"])
+def device(request, monkeypatch):
+    """As on a CPU, and as on a GPU."""
+    if request.param.startswith("no"):
+        monkeypatch.setattr("nmpm.emulator.engines.torch.contact.is_eager_cpu", lambda _: False)
+
+
 @pytest.mark.parametrize("obstacle", [floor, wall, block])
 @pytest.mark.parametrize("speed", [0.0, 0.9, 32.0])
-def test_both_forms_agree(obstacle, speed):
+def test_scenes_are_held_as_alone_and_without_reading_values_back(obstacle, speed, monkeypatch):
     one, (start, jitter) = obstacle(), jumble(3, 6, 0.1 * speed)
     contact = Contact(torch.cat([one.solid, torch.zeros_like(one.solid), one.solid]), GRID)
     ahead = torch.nn.functional.normalize(start - start.mean(1, keepdim=True), dim=-1).unsqueeze(1)
     path = jitter + speed * torch.arange(1, 7).view(1, -1, 1, 1) * ahead
     path[2] = start[2] + 0.01 * (path[2] - start[2])  # a scene of its own speed
-    by_branching, dense = contact.hold_touching(start, path), contact.hold_all(start, path)
-    assert not torch.equal(dense, path)
-    torch.testing.assert_close(dense, by_branching, rtol=0, atol=2e-4)
-    assert torch.equal(dense[1], path[1])
-    torch.testing.assert_close(by_branching[2:], one.hold_touching(start[2:], path[2:]))  # whatever others' speed
-    assert contact.hold_all(start[:, :0], path[:, :, :0]).shape == path[:, :, :0].shape
+    held = contact.hold(start, path)
+    assert not torch.equal(held, path)
+    assert torch.equal(held[1], path[1])
+    torch.testing.assert_close(held[2:], one.hold(start[2:], path[2:]))  # whatever others' speed
+    assert contact.hold(start[:, :0], path[:, :, :0]).shape == path[:, :, :0].shape
+    monkeypatch.setattr("nmpm.emulator.engines.torch.contact.is_eager_cpu", lambda _: False)
+    torch.testing.assert_close(contact.hold(start, path), held, rtol=0, atol=1e-5)
 
 
-def test_the_dense_form_in_chunks_is_the_same(monkeypatch):
+def test_in_chunks_it_is_the_same(monkeypatch):
     start, path = jumble()
-    whole = block().hold_all(start, path)
+    whole = block().hold(start, path)
     in_sevens = lambda count, *_, **__: [slice(i, i + 7) for i in range(0, count, 7)]  # noqa: E731
     monkeypatch.setattr("nmpm.emulator.engines.torch.contact.chunks", in_sevens)
-    torch.testing.assert_close(block().hold_all(start, path), whole, rtol=0, atol=1e-5)
+    torch.testing.assert_close(block().hold(start, path), whole, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("hold", ["hold_touching", "hold_all"])
-def test_padding_is_left_as_it_is_and_changes_no_other_path(hold):
+@pytest.mark.usefixtures("device")
+def test_padding_is_left_as_it_is_and_changes_no_other_path():
     start, path = jumble(2, speed=0.4)
     path[:, :, 40:] = start[:, None, 40:] + 20 * (path[:, :, 40:] - start[:, None, 40:])  # fast, some inside
     mask = torch.arange(50).expand(2, -1) < 40
     contact = Contact(block().solid.repeat(2, 1, 1, 1), GRID)
-    held = getattr(contact, hold)(start, path, mask)
-    assert torch.equal(held[:, :, :40], getattr(contact, hold)(start[:, :40], path[:, :, :40]))
+    held = contact.hold(start, path, mask)
+    assert torch.equal(held[:, :, :40], contact.hold(start[:, :40], path[:, :, :40]))
     assert torch.equal(held[:, :, 40:], path[:, :, 40:])
     assert not torch.equal(held, path)
 
 
+@pytest.mark.usefixtures("device")
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-@pytest.mark.parametrize("hold", ["hold_touching", "hold_all"])
-def test_a_step_that_is_not_finite_stays_so_and_disturbs_nobody(value, hold):
+def test_a_step_that_is_not_finite_stays_so_and_disturbs_nobody(value):
     begin, path = straight([5.0, 12.0], [0.0, -0.7])
     broken = path.clone()
     broken[0, 2:, 0, 1] = value
-    held = getattr(floor(), hold)(begin.repeat(1, 2, 1), torch.cat([path, broken], dim=2))
-    torch.testing.assert_close(held[:, :, :1], getattr(floor(), hold)(begin, path))
+    held = floor().hold(begin.repeat(1, 2, 1), torch.cat([path, broken], dim=2))
+    torch.testing.assert_close(held[:, :, :1], floor().hold(begin, path))
     assert not held[:, 2:, 1].isfinite().all()
 
 
