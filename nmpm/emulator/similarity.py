@@ -20,8 +20,7 @@ from nmpm.emulator.model import Emulator
 from nmpm.emulator.recipe import EmulatorRecipe
 from nmpm.emulator.similar_grid import SimilarGrid, aligned_scales, similar_grid
 from nmpm.errors import ConfigError
-from nmpm.scene import Motion as Motion
-from nmpm.scene import Reading, Scene
+from nmpm.scene import Motion, Reading, Scene
 
 _WHOLE = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20)
 STRIDES = tuple(Fraction(k) for k in _WHOLE) + tuple(Fraction(1, k) for k in _WHOLE[1:])
