@@ -46,7 +46,7 @@ examples:
                                                          or from data of another kind
   nmpm rollout runs/mixer --data mixer.npz --types 0=dough,1=blade --prescribed 1
                                                          with facts that the files lack
-  nmpm rollout wbcsph --gravity 6,7.5                    thrown blocks, where a model takes any gravity
+  nmpm rollout wbcsph --gravity 6,7.5                    thrown blocks, with gravity to one side
   nmpm rollout runs/goop/checkpoints/last.ckpt
   nmpm rollout goop --out splash.usda                    for Blender; .vtkhdf for ParaView, .csv, …
   nmpm rollout goop --device cuda                        on a GPU, by CUDA graphs
