@@ -33,11 +33,12 @@ def linear_g2p(field: Tensor, cells: Tensor, grid: Grid) -> Tensor:
     loose = cells.is_cuda and torch.are_deterministic_algorithms_enabled()
     if grid.dim == 1 or any(grid.periodic) or loose:
         return gather(linear_stencil(cells, grid), field.flatten(2).transpose(1, 2))
-    unit = (per_axis(operator.truediv, 2 * cells, grid.shape) - 1).flip(-1)  # the sampler wants the last axis first
+    unit = per_axis(operator.truediv, cells, [extent / 2 for extent in grid.shape]) - 1
     if not cells.is_cuda:
         unit = unit.nan_to_num()  # torch's CPU backward segfaults on NaN coordinates
     points = unit.reshape(unit.shape[0], *(1,) * (grid.dim - 1), *unit.shape[1:])
-    sampled = functional.grid_sample(field, points, mode="bilinear", padding_mode="border", align_corners=False)
+    last_first = field.transpose(2, -1)  # the order of axes that the sampler wants for coordinates in theirs
+    sampled = functional.grid_sample(last_first, points, mode="bilinear", padding_mode="border", align_corners=False)
     return sampled.flatten(2).transpose(1, 2)
 
 

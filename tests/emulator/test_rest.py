@@ -89,7 +89,7 @@ def test_kernels_and_masks_hold_the_same_particles(name, monkeypatch):
     fused = emulator(state).position
     with without_kernels():
         tensors = emulator(state).position
-        monkeypatch.setattr("nmpm.emulator.engines.torch.support.is_eager_cpu", lambda _: False)
+        monkeypatch.setattr("nmpm.emulator.engines.torch.advection.is_eager_cpu", lambda _: False)
         torch.testing.assert_close(emulator(state).position, tensors, rtol=0, atol=0)
     moved = (tensors[:, -1] - state.position).norm(dim=-1) > 1e-5
     assert ("channel" in name) or 0.1 < moved.float().mean() < 0.95

@@ -17,7 +17,7 @@ from nmpm.emulator.engines.torch.contact import SURFACE, Contact, obstacle_share
 from nmpm.emulator.engines.torch.crowding import Crowding
 from nmpm.emulator.engines.torch.energy import EnergyLimit
 from nmpm.emulator.engines.torch.start import BundleStart
-from nmpm.emulator.engines.torch.support import Support
+from nmpm.emulator.engines.torch.support import Support, drops
 from nmpm.transfer.execution import is_eager_cpu
 from nmpm.transfer.linear import linear_g2p
 
@@ -130,9 +130,10 @@ class Advection:
             return path
         obstacle = obstacle_share(solid, emulator.walls) if emulator.scene.obstacles else None
         support = Support(start.filled(len(emulator.scene.materials)), obstacle, emulator.scene, emulator.grid)
-        held = support.holds(start.cells, start.gravity)[:, None, :, None]
-        fallen = self._confine(support.fall(start.cells, start.gravity, path.shape[1]))
-        return torch.where(still[:, None, :, None], torch.where(held, start.cells.unsqueeze(1), fallen), path)
+        fallen = start.cells.unsqueeze(1) + drops(start.gravity, path.shape[1])
+        held = support.holds(start.cells, fallen[:, -1], start.gravity)[:, None, :, None]
+        resting = torch.where(held, start.cells.unsqueeze(1), self._confine(fallen))
+        return torch.where(still[:, None, :, None], resting, path)
 
     def _confine(self, cells: Tensor) -> Tensor:
         """Positions (..., D) within the walls; other axes have none (periodic ones are unwrapped: transfers wrap)."""

@@ -14,7 +14,6 @@ Source: Kugelstadt, Longva, Thürey & Bender, Implicit Density Projection for Vo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -61,41 +60,34 @@ class Crowding:
         excess = full - self.free
         if is_eager_cpu(excess) and not bool((excess > 0).any()):
             return None
-        flow = torch.cat(self._flow(excess), dim=1)
-        shift = linear_g2p(flow, cells, self.grid)
-        return torch.where(volume > 0, shift.clamp(-MAX_SHIFT, MAX_SHIFT), 0.0)
+        shift = linear_g2p(self._flow(excess.flatten(1)), cells, self.grid)
+        return shift.clamp(-MAX_SHIFT, MAX_SHIFT) * (volume > 0)
 
-    def _flow(self, excess: Tensor) -> list[Tensor]:
-        """Displacement at the nodes along each axis, D tensors (B, 1, *S), for their excess (B, 1, *S)."""
-        faces = self._faces(excess.dtype)
-        diagonal = sum((face + _roll(face, 1, axis) for axis, face in enumerate(faces)), start=excess.new_zeros(()))
-        inverse = torch.where(diagonal > CLOSED, 1 / diagonal.clamp(min=CLOSED), 0.0)
-        pressure = (inverse * excess).clamp(min=0)
+    def _flow(self, excess: Tensor) -> Tensor:
+        """(B, D, *S) displacement at the nodes for their excess (B, size)."""
+        beside, faces = self._faces(excess.dtype)
+        total = faces.sum(1)
+        inverse = (total > CLOSED) / total.clamp(min=CLOSED)
+        share, alone = inverse.unsqueeze(1) * faces, inverse * excess
+        pressure = alone.clamp(min=0)
         for _ in range(SWEEPS - 1):
-            left = excess
-            for axis, flux in enumerate(_fluxes(pressure, faces)):
-                left = left - flux + _roll(flux, 1, axis)
-            pressure = (pressure + inverse * left).clamp(min=0)
-        return [(flux + _roll(flux, 1, axis)) / 2 for axis, flux in enumerate(_fluxes(pressure, faces))]
+            pressure = (alone + (share * pressure[:, beside]).sum(1)).clamp(min=0)
+        forth, back = (faces * (pressure.unsqueeze(1) - pressure[:, beside])).unflatten(1, (-1, 2)).unbind(2)
+        flow: Tensor = ((forth - back) / 2).unflatten(-1, self.grid.shape)
+        return flow
 
-    def _faces(self, dtype: torch.dtype) -> list[Tensor]:
-        """For each axis the conductance of the faces (B or 1, 1, *S) from each node to the next; zero at solids."""
-        first, faces = self.grid.spacing[0], []
-        for axis, (spacing, extent) in enumerate(zip(self.grid.spacing, self.grid.shape, strict=True)):
-            free = self.free.to(dtype)
-            face = torch.minimum(free, _roll(free, -1, axis)) * (first / spacing) ** 2
-            if not self.grid.periodic[axis]:
-                last = torch.arange(extent, device=face.device) == extent - 1
-                face = torch.where(last.view(-1, *(1,) * (self.grid.dim - 1 - axis)), 0.0, face)
-            faces.append(face)
-        return faces
+    def _faces(self, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """The 2 D nodes beside each, after and before it along each axis, and the conductance of the faces to them.
 
-
-def _fluxes(pressure: Tensor, faces: Sequence[Tensor]) -> list[Tensor]:
-    """For each axis the displacement through the faces from each node to the next."""
-    return [face * (pressure - _roll(pressure, -1, axis)) for axis, face in enumerate(faces)]
-
-
-def _roll(values: Tensor, by: int, axis: int) -> Tensor:
-    """Values (B, C, *S) moved along one of the grid's axes, around its ends."""
-    return torch.roll(values, by, axis + 2)
+        Indices (2 D, size) and numbers (B or 1, 2 D, size), zero at solids and walls.
+        """
+        grid, free = self.grid, self.free[:, 0].to(dtype)
+        order = torch.arange(grid.size, device=free.device).view(grid.shape)
+        beside, faces = [], []
+        for axis, (spacing, wraps) in enumerate(zip(grid.spacing, grid.periodic, strict=True)):
+            after = order.roll(-1, axis)
+            face = torch.minimum(free, free.roll(-1, axis + 1)) * (grid.spacing[0] / spacing) ** 2
+            face = face if wraps else face * (after > order)
+            beside += [after, order.roll(1, axis)]
+            faces += [face, face.roll(1, axis + 1)]
+        return torch.stack(beside).flatten(1), torch.stack(faces, dim=1).flatten(2)

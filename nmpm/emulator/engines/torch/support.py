@@ -14,11 +14,11 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from nmpm.emulator.engines.torch.contact import SURFACE
 from nmpm.grid import Grid
 from nmpm.scene import Scene
-from nmpm.transfer.execution import is_eager_cpu
 from nmpm.transfer.linear import linear_g2p
 
 REACH = 2
@@ -38,8 +38,8 @@ def drops(gravity: Tensor, frames: int) -> Tensor:
     """
     count = torch.arange(1, frames + 1, device=gravity.device, dtype=gravity.dtype).view(-1, 1, 1)
     longest = frames * (frames + 1) / 2 * gravity.norm(dim=-1, keepdim=True)
-    fallen: Tensor = (gravity * (MAX_DROP / longest.clamp(min=MAX_DROP))).unsqueeze(1) * (count * (count + 1) / 2)
-    return fallen
+    largest: Tensor = gravity * (MAX_DROP / 2 / longest.clamp(min=MAX_DROP))
+    return largest.unsqueeze(1) * torch.addcmul(count, count, count)
 
 
 def floor_rows(scene: Scene, grid: Grid) -> tuple[tuple[int, int], ...]:
@@ -67,91 +67,83 @@ class Support:
     scene: Scene
     grid: Grid
 
-    def holds(self, cells: Tensor, gravity: Tensor) -> Tensor:
-        """(B, N) bool: whether the cells of particles (B, N, D) are supported against gravity (B, 1, D)."""
-        node = torch.zeros_like(cells[..., 0], dtype=torch.long)
-        for column, extent, wraps in zip(cells.unbind(-1), self.grid.shape, self.grid.periodic, strict=True):
-            row = column.nan_to_num(0.0, 0.0, 0.0).floor().long()
-            node = node * extent + (row.remainder(extent) if wraps else row.clamp(0, extent - 1))
-        return self.supported_cells(gravity).flatten(1).gather(1, node)
+    def holds(self, cells: Tensor, ends: Tensor, gravity: Tensor) -> Tensor:
+        """(B, N) bool: whether something holds particles up that would fall from cells to ends (B, N, D).
 
-    def fall(self, cells: Tensor, gravity: Tensor, frames: int) -> Tensor:
-        """(B, m, N, D) positions of particles that fall from rest at (B, N, D); those that an obstacle stops stay."""
-        start = cells.unsqueeze(1)
-        fallen = start + drops(gravity, frames)
+        Below them against gravity (B, 1, D), or an obstacle on their way.
+        """
+        rows = cells.nan_to_num(0.0, 0.0, 0.0).floor().long()
+        node = torch.zeros_like(rows[..., 0])
+        for row, extent, wraps in zip(rows.unbind(-1), self.grid.shape, self.grid.periodic, strict=True):
+            node = node * extent + (row.remainder(extent) if wraps else row.clamp(0, extent - 1))
+        held = self.supported_cells(gravity).flatten(1).gather(1, node)
         if self.obstacle is None:
-            return fallen
-        stopped = linear_g2p(self.obstacle.to(cells.dtype), fallen[:, -1], self.grid) > SURFACE
-        return torch.where(stopped.unsqueeze(1), start, fallen)
+            return held
+        return held | (linear_g2p(self.obstacle.to(ends.dtype), ends, self.grid).squeeze(-1) > SURFACE)
 
     def supported_cells(self, gravity: Tensor) -> Tensor:
         """(B, *S) bool: whether the material in a cell is held up against gravity (B, 1, D)."""
-        result = torch.ones_like(self.filled[:, 0], dtype=torch.bool)
-        size = gravity.squeeze(1).abs()
-        taken = (size == 0).all(1)
-        for axis in range(self.grid.dim):
-            largest = (size[:, axis] == size.amax(1)) & ~taken  # the first of axes that are equal
-            taken = taken | largest
-            if self.grid.periodic[axis]:
-                continue
-            for upwards in (False, True):
-                pull = gravity[:, 0, axis]
-                pulled = largest & (pull > 0 if upwards else pull <= 0)
-                if is_eager_cpu(pulled) and not bool(pulled.any()):
-                    continue
-                here = pulled.view(-1, *(1,) * self.grid.dim)
-                result = result & (self._supported_along(axis, upwards) | ~here)  # ONNX Runtime's Where takes no bool
-        return result
+        pull = gravity.squeeze(1)
+        along = pull.abs().argmax(1)  # the first of axes that are equal
+        breaks = torch.zeros_like(self.filled[:, 0])
+        for axis in (axis for axis, wraps in enumerate(self.grid.periodic) if not wraps):
+            acts = (along == axis) & (pull[:, axis] != 0)
+            broken = self._broken_along(axis, pull[:, axis] > 0)
+            breaks = torch.addcmul(breaks, broken, acts.view(-1, *(1,) * self.grid.dim).to(broken.dtype))
+        return breaks == 0
 
-    def _supported_along(self, axis: int, upwards: bool) -> Tensor:
-        """(B, *S) bool, where gravity points to the lower end of an axis, or upwards."""
-        bears = _from_floor(self._bearing(axis), axis, upwards)
-        has_floor = self.scene.confined[axis]
-        rows = floor_rows(self.scene, self.grid)[axis][upwards] if has_floor else 0
-        base = torch.arange(bears.shape[-1], device=bears.device) < rows
+    def _broken_along(self, axis: int, upwards: Tensor) -> Tensor:
+        """(B, *S) 1 where support along an axis ends below a cell, else 0; gravity points upwards (B,), or down.
+
+        On the way up from the floor what happened last decides: a base, or a gap between bearing cells.
+        """
+        cells = self._widest(axis)
         if self.obstacle is not None:
-            base = base | _from_floor(self.obstacle[:, 0] >= SURFACE, axis, upwards)
-        bears = near = bears | base
+            cells = torch.cat([cells, self.obstacle.to(cells.dtype)], dim=1)
+        above = upwards.view(-1, *(1,) * (self.grid.dim + 1))
+        columns = _turned(cells.movedim(axis + 2, -1), above)
+        count, has_floor = columns.shape[-1], self.scene.confined[axis]
+        low, high = floor_rows(self.scene, self.grid)[axis] if has_floor else (0, 0)
+        order = torch.arange(count, device=columns.device, dtype=columns.dtype)
+        base = order < low + (high - low) * above.squeeze(1)
+        if self.obstacle is not None:
+            base = base | (columns[:, 1] >= SURFACE)
+        near = bears = base | (columns[:, 0] >= ENOUGH)
         for distance in range(1, REACH):
             near = near | _shift(bears, distance, fill=1)
-        gaps = (~near).int().cumsum(-1)  # in and below each cell; their number never falls on the way up
-        bottom = 0 if has_floor else -1  # beyond the lower end of an open axis nothing bears
-        last = torch.where(base, gaps, bottom)
-        if self.obstacle is not None:
-            last = _running_max(last, bottom)  # the number in the highest floor or obstacle cell so far
-        held = _shift(gaps, 1, fill=0) == _shift(last, 1, fill=bottom)
-        return (held.flip(-1) if upwards else held).movedim(-1, axis + 1)
+        gap = ~near
+        event = (2 * (order + 1) + gap) * (gap | base)  # odd where support ends
+        last = _running_max(_shift(event, 1, fill=0 if has_floor else 1))  # beyond an open axis nothing bears
+        return _turned(last.remainder(2).unsqueeze(1), above).squeeze(1).movedim(-1, axis + 1)
 
-    def _bearing(self, axis: int) -> Tensor:
-        """(B, *S) bool: whether a cell or one beside it, across the axis, is filled enough."""
-        bears = self.filled[:, 0] >= ENOUGH
-        for other, wraps in enumerate(self.grid.periodic):
-            if other == axis:
-                continue
-            row = bears.movedim(other + 1, -1)
-            if wraps:
-                sides = row.roll(1, -1) | row.roll(-1, -1)
-            else:
-                sides = _shift(row, 1, fill=0) | _shift(row.flip(-1), 1, fill=0).flip(-1)
-            bears = (row | sides).movedim(-1, other + 1)
-        return bears
+    def _widest(self, axis: int) -> Tensor:
+        """(B, 1, *S): the largest volume fraction in a cell and those beside it, across the axis."""
+        across = [int(other != axis) for other in range(self.grid.dim)]
+        wraps = [side * periodic for side, periodic in zip(across, self.grid.periodic, strict=True)]
+        walls = [side - wrap for side, wrap in zip(across, wraps, strict=True)]
+        filled = self.filled
+        if any(wraps):
+            ends = [side for wrap in reversed(wraps) for side in (wrap, wrap)]
+            filled = functional.pad(filled, ends, mode="circular")
+        pool = (functional.max_pool1d, functional.max_pool2d, functional.max_pool3d)[self.grid.dim - 1]
+        widest: Tensor = pool(filled, [2 * side + 1 for side in across], stride=1, padding=walls)
+        return widest
 
 
-def _from_floor(values: Tensor, axis: int, upwards: bool) -> Tensor:
-    """(B, *S) with the cells along an axis last, from the floor up; gravity points to the axis' upper end or not."""
-    columns = values.movedim(axis + 1, -1)
-    return columns.flip(-1) if upwards else columns
+def _turned(values: Tensor, turns: Tensor) -> Tensor:
+    """Values (B, ..., n), the last axis reversed in scenes where `turns` (B, ...) is True."""
+    return torch.where(turns, values.flip(-1), values)
 
 
 def _shift(values: Tensor, by: int, fill: int) -> Tensor:
     """(..., n) moved `by` < n places on."""
-    return torch.cat([torch.full_like(values[..., :by], fill), values[..., :-by]], dim=-1)
+    return functional.pad(values, (by, -by), value=fill)
 
 
-def _running_max(values: Tensor, least: int) -> Tensor:
-    """(..., n): the largest so far of counts (..., n) from `least` on; `torch.cummax` cannot be exported to ONNX."""
-    by = 1
+def _running_max(values: Tensor) -> Tensor:
+    """(B, ..., n): the largest so far of counts (B, ..., n); `torch.cummax` cannot be exported to ONNX."""
+    largest, by = values.flatten(1, -2), 1
     while by < values.shape[-1]:
-        values = torch.maximum(values, _shift(values, by, fill=least))
-        by *= 2
-    return values
+        largest = functional.max_pool1d(functional.pad(largest, (7 * by, 0)), 8, stride=1, dilation=by)
+        by *= 8
+    return largest.view(values.shape)
