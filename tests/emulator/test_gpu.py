@@ -13,8 +13,9 @@ import torch
 from nmpm.data.initial_states import lattice
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip
 from nmpm.emulator import Emulator, RolloutContext, rollout
-from nmpm.emulator.engines import ENGINES, find_engine, rules
+from nmpm.emulator.engines import ENGINES, find_engine, graphs, rules
 from nmpm.emulator.engines.torch.engine import TorchEngine
+from nmpm.emulator.rollouts import recomputed
 from nmpm.particles import Particles
 from nmpm.processors import UNet
 from nmpm.training import recorded_steps
@@ -81,7 +82,7 @@ def triton(monkeypatch, device):
 def on_gpu(monkeypatch) -> None:
     """Let engines be chosen as on a CUDA GPU with Triton."""
     monkeypatch.setattr(rules.Call, "device", "cuda")
-    monkeypatch.setattr(rules, "RECORDINGS", (rules.Rule("a stand-in for a GPU", (), lambda _: True),))
+    monkeypatch.setattr(graphs, "RECORDINGS", (rules.Rule("a stand-in for a GPU", (), lambda _: True),))
     monkeypatch.setattr(rules, "_has_triton", lambda: True)
 
 
@@ -191,6 +192,10 @@ def test_kernels_that_give_what_torch_gives_are_used(device, recwarn):
     emulator, state = moving(box(obstacles=True), energy=True).to(device), state_of(box(obstacles=True), **FAST)
     emulator(state.to(device))
     assert find_engine(emulator, state.to(device), emulator.solid(state.to(device))).name == "triton"
+    trained = moving(box(materials=("water", "sand"))).train().requires_grad_().to(device)
+    state = state_of(trained.scene).to(device)
+    recomputed(trained, state, trained.context(state)).position.sum().backward()
+    assert find_engine(trained, state, trained.solid(state)).name == "triton training"
     assert not recwarn.list
 
 
@@ -229,6 +234,31 @@ def test_kernels_that_fail_or_differ_are_left_to_torch_with_one_warning(change, 
             warnings.simplefilter("error")
             assert torch.equal(emulator(state).position, expected.position)
     assert find_engine(emulator, state, emulator.solid(state)).name == ("torch" if complaint else "triton")
+
+
+class WrongGradient(torch.autograd.Function):
+    """Of a path, larger than it is by a tenth."""
+
+    @staticmethod
+    def forward(ctx, path):
+        return path.clone()
+
+    @staticmethod
+    def backward(ctx, slope):
+        return 1.1 * slope
+
+
+def test_trainings_are_left_to_torch_where_gradients_differ(monkeypatch):
+    class Kernels(TorchEngine):
+        def path(self, start, output, context):
+            return WrongGradient.apply(super().path(start, output, context))
+
+    made = SimpleNamespace(TritonTraining=lambda emulator, _: Kernels(emulator))
+    monkeypatch.setitem(sys.modules, "nmpm.emulator.engines.triton.training", made)
+    on_gpu(monkeypatch)
+    emulator, state = moving(box()).train().requires_grad_(), state_of(box())
+    with pytest.warns(UserWarning, match=r"Kernels in Triton are not used on cpu.*gradients of positions differ by"):
+        assert find_engine(emulator, state, emulator.solid(state)).name == "torch"
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def find_engine(emulator: Emulator, particles: Particles, solid: Tensor) -> Engine[Any, Any]:
     """The engine that computes a call, of a state among solids (B, C_solid, *S)."""
     name = call_engine(emulator, particles, solid)
-    if name == "triton" and not emulator.kernel_trial.passes(emulator, particles, solid):
+    if name.startswith("triton") and not emulator.kernel_trial.passes(emulator, particles, solid):
         name = "torch"
     return ENGINES[name](emulator)
 

@@ -21,10 +21,16 @@ _ENGINES: Mapping[str, str] = MappingProxyType(
         "numba": "Numba kernels",
         "numba training": "Numba kernels with gradients",
         "triton": "Triton kernels",
+        "triton training": "Triton kernels with gradients",
     }
 )
 _FASTEST: Mapping[tuple[str, bool], str] = MappingProxyType(
-    {("cpu", False): "numba", ("cpu", True): "numba training", ("cuda", False): "triton"}
+    {
+        ("cpu", False): "numba",
+        ("cpu", True): "numba training",
+        ("cuda", False): "triton",
+        ("cuda", True): "triton training",
+    }
 )
 """The engine made for a kind of device, and for rollouts or trainings."""
 
@@ -53,7 +59,7 @@ def _engine(emulator: Emulator, state: Particles, training: bool) -> str:
     with torch.set_grad_enabled(training):
         name, faster = call_engine(form, state, solid), _FASTEST.get((state.position.device.type, training), "torch")
         missing = [*lacks(faster, MODELS, form.recipe), *lacks(faster, CALLS, Call(form, state, solid))]
-    if name == "triton" and (difference := emulator.kernel_trial.difference(emulator)):
+    if name.startswith("triton") and (difference := emulator.kernel_trial.difference(form)):
         return f"{_ENGINES['torch']}; Triton kernels are not used: {difference}"
     if name == faster:
         return _ENGINES[name]

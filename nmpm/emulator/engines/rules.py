@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from nmpm.emulator.model import Emulator
     from nmpm.emulator.recipe import EmulatorRecipe
 
-FASTER = ("numba", "numba training", "triton")
+FASTER = ("numba", "numba training", "triton", "triton training")
 """Engines beside "torch", by name; of those that take a call the first one computes it."""
 
 T = TypeVar("T")
@@ -128,21 +128,27 @@ MODELS: tuple[Rule[EmulatorRecipe], ...] = (
 
 CALLS: tuple[Rule[Call], ...] = (
     Rule("a CPU", ("numba", "numba training"), lambda call: call.device == "cpu"),
-    Rule("a CUDA GPU", ("triton",), lambda call: call.device == "cuda"),
+    Rule("a CUDA GPU", ("triton", "triton training"), lambda call: call.device == "cuda"),
     Rule("machines without Triton", ("numba", "numba training"), lambda _: not _has_triton()),
     Rule("other devices", (), lambda call: call.device not in ("cpu", "cuda")),
     Rule("rollouts", ("numba", "triton"), lambda call: not call.emulator.training),
-    Rule("trainings", ("numba training",), lambda call: call.emulator.training),
+    Rule("trainings", ("numba training", "triton training"), lambda call: call.emulator.training),
     Rule("float64", (), lambda call: not call.is_float32),
     Rule("moving obstacles in the state", (), lambda call: call.particles.obstacle_velocity is not None),
-    Rule("sizes of particles", ("numba training",), lambda call: call.particles.volume is not None),
-    Rule("several sizes in a scene", (), lambda call: call.sizes_differ),
+    Rule(
+        "sizes of particles", ("numba training", "triton", "triton training"),
+        lambda call: call.particles.volume is not None,
+    ),
+    Rule("several sizes in a scene", ("triton", "triton training"), lambda call: call.sizes_differ),
     Rule("gradients of gravity or obstacles", (), lambda call: _need_gradients((call.particles.gravity, call.solid))),
     Rule(
-        "gradients of a rollout", ("numba training",),
+        "gradients of a rollout", ("numba training", "triton training"),
         lambda call: _need_gradients((*call.motion, *call.emulator.parameters())),
     ),
-    Rule("a recorded training step, which moves its grid", (), lambda call: type(call.emulator.grid) is not Grid),
+    Rule(
+        "a recorded training step, which moves its grid", ("triton training",),
+        lambda call: type(call.emulator.grid) is not Grid,
+    ),
     Rule("graphs that torch.compile traces", (), lambda _: torch.compiler.is_compiling()),
     Rule("nmpm.transfer.without_kernels", (), lambda _: not kernels_are_on()),
     Rule(
@@ -217,6 +223,7 @@ TRIED: Mapping[str, str] = MappingProxyType(
         "numba": "every test, on CPUs",
         "numba training": "every test, on CPUs",
         "triton": "Triton's interpreter on CPUs; no GPU yet, so that the first call compares a bundle with torch",
+        "triton training": "Triton's interpreter on CPUs; no GPU yet, so that the first step compares gradients, too",
         "CUDA graphs": "tests with a stand-in; an NVIDIA H200 (torch engine, without fields, November 2026)",
         "openvino": "tests on CPUs",
         "windows": "tests on CPUs",
