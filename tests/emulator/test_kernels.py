@@ -55,7 +55,8 @@ def predict_both(emulator, particles):
 def share_that_differs(emulator, particles) -> float:
     """Share of the particles; one whose decision hangs on rounding (at rest or not, shortened or not) may differ."""
     fused, tensors = predict_both(emulator, particles)
-    return ((fused - tensors).abs() > LIMIT).any(-1).any(0).float().mean().nan_to_num().item()
+    differs = ((fused - tensors).abs() > LIMIT).any(-1).any(0)
+    return differs[particles.mask].float().mean().nan_to_num().item()
 
 
 # ---- rollouts

@@ -40,6 +40,7 @@ def spread_crowds(
     move = partial(drift, flow, path, start.mask, obstacle, parameters.grid, parameters.bounds, spread)
     map_ranges(move, split(len(start.cells), CHUNK), threads)
     share = 1.0 if budget is None else _affordable_share(start, path, spread, parameters, budget, threads)
+    path, spread = path[:, : len(start.cells)], spread[:, : len(start.cells)]
     path[:] = spread if share == 1 else path + np.float32(share) * (spread - path)
 
 

@@ -65,7 +65,9 @@ class NumbaEngine(Engine[StartArrays, Array]):
         threads, all_solids = torch.get_num_threads(), self._solids(context)
         for b in range(batch):
             unpack(predicted[b], scale, fields)
-            scene, solids = start.scene(b), all_solids[b]
+            scene, solids = start.real_scene(b), all_solids[b]
+            real = len(scene.cells)
+            path[b, :, real:] = start.cells[b, real:]  # padding stays
             find_path(scene, fields, parameters, _budget(context, b), path[b], threads)
             if parameters.obstacles and parameters.solids:
                 keep_clear(scene, parameters, solids, path[b], threads)
@@ -77,7 +79,7 @@ class NumbaEngine(Engine[StartArrays, Array]):
         """As of every engine, in place."""
         threads, solids = torch.get_num_threads(), self._solids(context)
         for b, path in enumerate(flight.path):
-            spread_crowds(start.scene(b), path, self.parameters, solids[b], _budget(context, b), threads)
+            spread_crowds(start.real_scene(b), path, self.parameters, solids[b], _budget(context, b), threads)
         return flight
 
     def land(self, start: StartArrays, flight: Flight[Array]) -> Bundle:  # noqa: ARG002 (other engines')

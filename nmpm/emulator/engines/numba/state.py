@@ -33,6 +33,19 @@ class StartArrays(NamedTuple):
         """One of the scenes."""
         return StartArrays(*(values[index] for values in self))
 
+    def real_scene(self, index: int) -> StartArrays:
+        """One of the scenes without the padding at its end."""
+        scene = self.scene(index)
+        n = count_real(scene.mask)
+        return StartArrays(
+            scene.cells[:n], scene.velocity[:n], scene.gravity, scene.material[:n], scene.mask[:n], scene.state
+        )
+
+
+def count_real(mask: Array) -> int:
+    """Particles of a mask (N,) but the padding at its end; all if there is nothing else."""
+    return len(mask) - int(mask[::-1].argmax()) if len(mask) else 0
+
 
 def rasterise(
     parameters: KernelParameters, position: Array, velocity: Array, gravity: Array, material: Array, mask: Array,
@@ -61,6 +74,8 @@ def _sum_particles(
 ) -> Array:  # fmt: skip
     """Fill in positions and velocities (N, D) of a scene in grid units, and return the sums of `scatter`."""
     (shape, wraps, steps), columns = parameters.p2g_grid, parameters.volume_channels[1]
+    real = count_real(mask)
+    to_cells(position[real:], velocity[real:], parameters.box, cells[real:], moved[real:])
 
     def add(low: int, high: int) -> Array:
         sums = np.zeros((parameters.size, columns), np.float32)
@@ -69,7 +84,7 @@ def _sum_particles(
         scatter(speeds, material[low:high], mask[low:high], here, shape, wraps, steps, sums)
         return sums
 
-    parts = map_ranges(add, split(len(cells), max(_CHUNK, 4 * parameters.size)), torch.get_num_threads())
+    parts = map_ranges(add, split(real, max(_CHUNK, 4 * parameters.size)), torch.get_num_threads())
     total = parts[0] if parts else np.zeros((parameters.size, columns), np.float32)
     for part in parts[1:]:
         total += part
