@@ -169,6 +169,17 @@ def test_every_variant_of_a_sweep_builds_a_model(name):
         assert bundle.position.isfinite().all(), variant
 
 
+def test_two_ranks_on_a_cpu_give_a_scaling_table(make_dataset, tmp_path):
+    data, sizes = make_dataset(train=((50, 9),) * 4), ("--batch", "1", "--width", "4", "--steps", "1", "--rounds", "2")
+    words = ("--device", "cpu", "--data", str(data), *sizes, "--json", str(tmp_path / "ranks.json"))
+    lines = run_script("ranks", *words).splitlines()
+    assert [line.split()[0] for line in lines[1:]] == ["ranks", "1", "2"]
+    one, two = json.loads((tmp_path / "ranks.json").read_text())["rows"]
+    assert two["windows_per_s"]["median"] == pytest.approx(2 / two["round_s"]["median"])
+    assert lines[2].split()[3] == "1"  # the efficiency of one rank
+    assert one["round_s"]["least"] <= one["round_s"]["median"] <= one["round_s"]["most"]
+
+
 def test_a_tree_equals_itself():
     text = run_script("frozen", str(ROOT.parent), "--only", "rollouts", "--models", "goop", "--rounds", "2")
     assert [line.split("  ")[-1].count("ms a frame") for line in text.splitlines()[1:]] == [1] * 4

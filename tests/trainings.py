@@ -69,10 +69,16 @@ def train(folder: Path, last: Path, devices: int = 1, ckpt_path: Path | None = N
     model = {"schedule": Schedule(warmup=30), "metrics": None} | noise | options.pop("model", {}) | optimizer
     module, record = module_of(data, **model), Record()
     module.emulator.calibrated.fill_(options.pop("calibrated", False))
+    averaging = [EMAWeightAveraging(decay=0.8, use_buffers=False)] if options.pop("average", False) else []
     strategy = "ddp" if devices > 1 else "auto"
     quiet = {**QUIET, "accelerator": "cpu", "enable_checkpointing": False, "limit_val_batches": 0}
     trainer = lightning.Trainer(
-        devices=devices, strategy=strategy, default_root_dir=last.parent, callbacks=[record], **quiet, **options
+        devices=devices,
+        strategy=strategy,
+        default_root_dir=last.parent,
+        callbacks=[record, *averaging],
+        **quiet,
+        **options,
     )
     trainer.fit(module, data, ckpt_path=ckpt_path, weights_only=True)
     trainer.save_checkpoint(last)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import operator
-import os
 import shlex
 import sys
 from pathlib import Path
@@ -18,7 +17,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
 from lightning.pytorch.utilities import rank_zero_only
 
-from nmpm._support.collectives import describe_ended_rank, is_lost_connection
+from nmpm._support.collectives import RankWatch, is_lost_connection
 from nmpm._support.devices import device_name, find_device
 from nmpm._support.threads import stated_threads
 from nmpm.cli.console import BriefParser, explain, is_of_other_packages
@@ -63,7 +62,7 @@ class EmulatorCLI(LightningCLI):
     """
 
     def __init__(self, command: str, note: str, locks: list[int], **options: Any) -> None:
-        self.command, self.note, self.locks, self.parent = command, note, locks, os.getppid()
+        self.command, self.note, self.locks = command, note, locks
         self.bfloat16_replaced = False
         super().__init__(EmulatorModule, TrajectoryDataModule, **options)
 
@@ -232,6 +231,8 @@ class EmulatorCLI(LightningCLI):
 
     def fit(self, **options: Any) -> None:
         """Train, then test the best weights; an interruption, or the end of another rank, says how to go on."""
+        rank = rank_zero_only.rank or 0  # type: ignore[attr-defined]  # (Lightning sets it)
+        watch = RankWatch(rank, lambda: getattr(self.trainer.strategy.launcher, "procs", []), self._how_to_go_on)
         try:
             self.trainer.fit(**options)
             self._test_best_weights()
@@ -244,17 +245,11 @@ class EmulatorCLI(LightningCLI):
         except RuntimeError as error:
             if not is_lost_connection(error):
                 raise
-            raise self._lost_rank_error() from None
-
-    def _lost_rank_error(self) -> BaseException:
-        """Names the rank that has ended, on one of those that are left: rank 0, or rank 1 where rank 0 has."""
-        if self.trainer.is_global_zero:
-            ended = describe_ended_rank(getattr(self.trainer.strategy.launcher, "procs", []))
-        elif self.trainer.global_rank == 1 and os.getppid() != self.parent:
-            ended = f"rank 0 (process {self.parent}) has ended"
-        else:
-            return SystemExit(1)
-        return NmpmError(f"{ended}: {self._how_to_go_on()}")
+            if line := watch.line():
+                raise NmpmError(line) from None
+            raise SystemExit(1) from None
+        finally:
+            watch.stop()
 
     def _how_to_go_on(self) -> str:
         if not self.run_folder.checkpoints["last"].is_file():
