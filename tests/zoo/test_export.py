@@ -261,7 +261,7 @@ def test_a_file_that_differs_from_its_model_is_deleted(tmp_path, monkeypatch, ca
         (["export", "nothing.ckpt"], "there is no such checkpoint"),
         (["export", "goop", "--format", "pt2", "--out", "goop.onnx"], "its name must end in .pt2"),
         (["export", "goop", "--out", "nowhere/goop.onnx"], "the folder nowhere does not exist"),
-        (["export", "waterramps"], "Export with --free"),
+        (["export", "waterramps"], "export with --free"),
         (["export", "goop", "--device", "cuda"], "ONNX files run on any device"),
     ],
 )
