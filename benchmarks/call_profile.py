@@ -5,6 +5,7 @@ python benchmarks/call_profile.py --threads 1 --models goop waterramps --json ca
 Each part is called by itself, in turn with the others and with the whole call, 20 bundles into a rollout of a scene of
 the model's own; CPU time in µs, least, median (quartiles) over the rounds. "Rest" is a call without its network and
 without the kernels: Python and torch between them. The kernels' own time contains the conversion of tensors to arrays.
+Beside it stand the files and functions of the package that a call runs through.
 """
 
 from __future__ import annotations
@@ -13,11 +14,14 @@ import copy
 import statistics
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import torch
 from timing import clock_for, describe_machine, make_timing_parser, time_alternating, write_json
 
+import nmpm
 from nmpm.emulator import Emulator, RolloutContext
 from nmpm.emulator.engines import find_engine
 from nmpm.evaluation.stress import ModelUnderTest
@@ -25,6 +29,7 @@ from nmpm.particles import Particles
 from nmpm.sim import load_preset
 from nmpm.zoo import Zoo
 
+PACKAGE = str(Path(nmpm.__file__).parent)
 CALL = "call"
 NETWORK = "network"
 BUNDLES = 20
@@ -64,6 +69,22 @@ def count_operations(action: Callable[[], object]) -> int:
     return sum(event.count for event in profile.key_averages())
 
 
+def count_code(action: Callable[[], object]) -> tuple[int, int]:
+    """Files and functions of the package that an action runs through."""
+    seen: set[tuple[str, str]] = set()
+
+    def see(frame: FrameType, event: str, _: object) -> None:
+        if event == "call" and frame.f_code.co_filename.startswith(PACKAGE):
+            seen.add((frame.f_code.co_filename, frame.f_code.co_qualname))
+
+    sys.setprofile(see)
+    try:
+        action()
+    finally:
+        sys.setprofile(None)
+    return len({file for file, _ in seen}), len(seen)
+
+
 def summarise(seconds: Mapping[str, list[float]]) -> dict[str, Any]:
     """Least and quartiles of each part in µs, and of what is left of a call in the same round."""
     rest = [2 * call - sum(values) for call, *values in zip(seconds[CALL], *seconds.values(), strict=True)]
@@ -90,9 +111,11 @@ def main() -> None:
         with torch.no_grad():
             parts = split_call(emulator, state, context)
             found[name] = summarise(time_alternating(parts, chosen.rounds, clock_for(chosen.device)))
+            files, functions = count_code(parts[CALL])
             around = count_operations(parts[CALL]) - count_operations(parts[NETWORK])
         sys.stdout.write(
-            f"{name}, {state.position.shape[1]} particles; {around} operations of torch around its network\n"
+            f"{name}, {state.position.shape[1]} particles; {around} operations of torch around its network;"
+            f" {functions} functions in {files} files\n"
         )
         for part, (least, low, middle, high) in found[name].items():
             sys.stdout.write(f"  {part:<34}{least:8.0f}{middle:8.0f} ({low:.0f}-{high:.0f})\n")

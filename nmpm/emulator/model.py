@@ -11,7 +11,7 @@ import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -243,6 +243,12 @@ class Emulator(nn.Module):
         cells, velocity, gravity = self.grid.isotropic_units(*self.in_cells(particles))
         share = mass_shares(self.scene, particles.material, particles.present_volume, cells.dtype)
         return energy(cells, velocity, gravity, share)
+
+    def train(self, mode: bool = True) -> Self:
+        """As torch's. A training needs the memory of recorded calls, so these are dropped."""
+        if mode:
+            self.recorded_calls = RecordedCalls()
+        return super().train(mode)
 
     def normalise(self, state: Tensor) -> Tensor:
         """The processor's input for a grid state (B, C_in, *S) in grid units."""

@@ -35,6 +35,7 @@ PARTS = [
 ]
 WALLS = box(materials=("water", "sand"), densities=(1000.0, 1600.0))
 SCENES = {"walls": WALLS, "channel": box(obstacles=True, **CHANNEL), "three axes": box(3, obstacles=True)}
+SCENES["a temperature"] = box(evolving=("heat",), parameters=("friction",))
 
 
 @pytest.fixture(autouse=True)
@@ -46,7 +47,10 @@ def _no_autocast(monkeypatch):
 def window(scene) -> Window:
     state = cloud(scene, count=9, batch=2, statics=4)
     steps = torch.arange(-1, 5).view(1, -1, 1, 1)
-    return window_of(state, state.position.unsqueeze(1) + steps * state.velocity.unsqueeze(1)).to("meta")
+    made = window_of(state, state.position.unsqueeze(1) + steps * state.velocity.unsqueeze(1))
+    made.fields = {name: torch.rand(2, 6, 9) for name in scene.evolving}
+    made.fields |= {name: torch.rand(2, 1, 1) for name in scene.parameters}
+    return made.to("meta")
 
 
 def on_meta(scene, **parts) -> Emulator:

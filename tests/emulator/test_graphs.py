@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from nmpm.emulator import Emulator, rollout
-from nmpm.emulator.engines import graphs, rules
+from nmpm.emulator.engines import graphs
 from nmpm.emulator.rollouts import predict_rollout
 from nmpm.transfer import scatter_backend, without_kernels
 from tests.scenes import box, cloud, emulator_of
@@ -36,7 +36,7 @@ def replayed(monkeypatch):
         return replay, result
 
     bundles = []
-    monkeypatch.setattr(rules, "RECORDINGS", rules.RECORDINGS[1:])
+    monkeypatch.setattr(graphs, "RECORDINGS", graphs.RECORDINGS[1:])
     monkeypatch.setattr(graphs, "record", record)
     return bundles
 
@@ -148,3 +148,13 @@ def test_what_cannot_be_recorded_is_said_once(replayed, monkeypatch):
         warnings.simplefilter("error")
         assert torch.equal(rollout(emulator, state, 3), expected)
     assert replayed == []
+
+
+def test_a_training_frees_the_recordings(replayed):
+    emulator, state = small(), cloud(box())
+    for _ in range(3):
+        emulator(state)
+    before, recordings = len(replayed), emulator.recorded_calls
+    emulator.train().eval()(state)
+    assert len(replayed) == before > 0
+    assert emulator.recorded_calls is not recordings

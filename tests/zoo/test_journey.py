@@ -47,6 +47,8 @@ def test_a_fine_tuned_model_is_added_loaded_and_exported(fit, home, tmp_path, ca
     state = tuned.example(count=50)
     assert torch.equal(tuned.rollout(state, 8), Zoo.load(home / "zoo" / "first" / "tuned").rollout(state, 8))
     assert main(["zoo", "card", "first/tuned"]) == 0
-    assert "# first/tuned" in capsys.readouterr().out
+    card = capsys.readouterr().out
+    assert "# first/tuned" in card
+    assert "rollouts   Numba kernels" in card
     assert main(["export", "first/tuned", "--processor", "--out", "network.onnx"]) == 0
     assert onnxruntime.InferenceSession(tmp_path / "network.onnx").get_inputs()
