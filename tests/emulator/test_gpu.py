@@ -22,9 +22,6 @@ from nmpm.training import recorded_steps
 from nmpm.transfer import without_kernels
 from tests.scenes import CHANNEL, box, cloud, emulator_of, window_of, with_obstacle
 
-if not torch.cuda.is_available():
-    os.environ.setdefault("TRITON_INTERPRET", "1")  # read where kernels are defined
-
 
 def moving(scene, reach: float = 0.3, cells=16, frames: int = 3, **parts) -> Emulator:
     """With random weights that move particles by about `reach` cells in a frame."""
