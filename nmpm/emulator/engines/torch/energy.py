@@ -42,13 +42,13 @@ class EnergyLimit:
         """
         terms = torch.cat([step * step, step, cells], dim=-1)
         of_all = self._double_energies(terms, self.share)
-        over = of_all.sum(-1) - 2 * self.budget
+        over = of_all.sum(-1) - self._double_budget
         if is_eager_cpu(over) and not bool((over > 0).any()):
             return None
         gains = self._gains(cells, step, before)
         kinetic, fall, _ = torch.stack([self._double_energies(terms, self.share * gains), of_all], dim=1).unbind(-1)
-        part, suffices = _smallest_cut(kinetic, fall, over)
-        return (gains | ~suffices.view(-1, 1, 1)) * part.view(-1, 1, 1)
+        part, by_all = _smallest_cut(kinetic, fall, over)
+        return (gains | by_all.view(-1, 1, 1)) * part.view(-1, 1, 1)
 
     def share_within(self, start: Tensor, path: Tensor, other: Tensor) -> Tensor:
         """(B,) the part of the way from a path to another, (B, m, N, D) from start (B, N, D), that no frame forbids.
@@ -68,6 +68,10 @@ class EnergyLimit:
         sums = (terms * share).sum(1) * self._worth
         doubled: Tensor = sums.unflatten(-1, (3, -1)).sum(-1)
         return doubled
+
+    @cached_property
+    def _double_budget(self) -> Tensor:
+        return 2 * self.budget
 
     @cached_property
     def _worth(self) -> Tensor:
@@ -97,7 +101,7 @@ def affordable_share(before: Tensor, after: Tensor, budget: Tensor) -> Tensor:
 
 
 def _smallest_cut(kinetic: Tensor, fall: Tensor, over: Tensor) -> tuple[Tensor, Tensor]:
-    """(B,) the part of steps that must not be gone, and whether it suffices that the particles of column 0 do so.
+    """(B,) the part of steps that must not be gone, and whether by all, as the particles of column 0 cannot suffice.
 
     From twice the kinetic energies and falls (B, 2) of these particles, and of all, in column 1, and twice what their
     scene exceeds its energy by (B,). If even all cannot suffice, the part with the least energy.
@@ -108,6 +112,6 @@ def _smallest_cut(kinetic: Tensor, fall: Tensor, over: Tensor) -> tuple[Tensor, 
     root = torch.addcmul(steepness * steepness, kinetic, over, value=-1).clamp(min=least**2).sqrt()
     needed = over / (steepness + root)
     lowest = (steepness / kinetic.clamp(min=least)).clamp(max=1)
-    suffices = needed[:, 0] <= lowest[:, 0]
-    part = torch.where(suffices, needed[:, 0], torch.minimum(needed[:, 1], lowest[:, 1]))
-    return part.nan_to_num(0.0), suffices
+    by_all = needed[:, 0] > lowest[:, 0]
+    part = torch.where(by_all, torch.minimum(needed[:, 1], lowest[:, 1]), needed[:, 0])
+    return part.nan_to_num(0.0), by_all
