@@ -144,6 +144,7 @@ def _running_max(values: Tensor) -> Tensor:
     """(B, ..., n): the largest so far of counts (B, ..., n); `torch.cummax` cannot be exported to ONNX."""
     largest, by = values.flatten(1, -2), 1
     while by < values.shape[-1]:
-        largest = functional.max_pool1d(functional.pad(largest, (7 * by, 0)), 8, stride=1, dilation=by)
+        padded = functional.pad(largest, (7 * by, 0), value=-1)  # zeros ONNX Runtime would fuse, and then refuse
+        largest = functional.max_pool1d(padded, 8, stride=1, dilation=by)
         by *= 8
     return largest.view(values.shape)
