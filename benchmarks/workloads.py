@@ -139,10 +139,7 @@ def make_scenes(preset: str, count: int, batch: int) -> tuple[Scene, Particles]:
     """Thrown blocks in a preset's box, (batch, count) particles, refined if need be so that they fill a fifth of it."""
     scene = load_preset(preset).scene
     scene = dataclasses.replace(scene, particle_volume=min(scene.particle_volume, 0.2 * scene.volume / count))
-    states = [thrown_blocks(scene, count=count, blocks=2, seed=seed) for seed in range(batch)]
-    names = [name for name, values in vars(states[0]).items() if isinstance(values, Tensor)]
-    joined = {name: torch.cat([getattr(s, name) for s in states]) for name in names}
-    return scene, Particles(**joined)
+    return scene, Particles.stack([thrown_blocks(scene, count=count, blocks=2, seed=seed) for seed in range(batch)])
 
 
 class TrainingStep:

@@ -9,12 +9,15 @@ one for each particle, such as a temperature, or one for each scene, such as a f
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Self
 
 import torch
 from torch import Tensor
+
+_SHARED = ("material", "mask", "obstacle", "obstacle_mask", "gravity", "obstacle_share", "volume")
+"""What particles and windows both have, unchanged."""
 
 
 class Batched:
@@ -84,6 +87,20 @@ class Particles(Batched):
         if self.obstacle_velocity is not None:
             _check_shape("Particles.obstacle_velocity", self.obstacle_velocity, [tuple(self.obstacle.shape)])
 
+    @classmethod
+    def stack(cls, states: Sequence[Particles]) -> Particles:
+        """The scenes of several states, at least one, padded to the largest: scene b's own particles are `mask[b]`.
+
+        Raises:
+            ValueError: if some have fields, volumes, shares or velocities of obstacles that others lack.
+        """
+        tensors = [{name: v for name, v in vars(state).items() if isinstance(v, Tensor)} for state in states]
+        for kind, have in (("tensors", tensors), ("fields", [state.fields for state in states])):
+            if differ := set[str]().union(*have).difference(set(have[0]).intersection(*have)):
+                raise ValueError(f"Not all of the states to stack have the {kind} {', '.join(sorted(differ))}.")
+        fields = {name: _stacked([state.fields[name] for state in states]) for name in states[0].fields}
+        return cls(**{name: _stacked([each[name] for each in tensors]) for name in tensors[0]}, fields=fields)
+
     @property
     def present_volume(self) -> Tensor:
         """(B, N) volume of each particle as a multiple of the scene's, 0 for padding; the mask where all are alike."""
@@ -145,34 +162,21 @@ class Window(Batched):
     @classmethod
     def of(cls, state: Particles) -> Self:
         """The two frames (B, 2, N, D) of a state, and none to predict."""
-        return cls(
-            frames=torch.stack([state.position - state.velocity, state.position], dim=1),
-            material=state.material,
-            mask=state.mask,
-            obstacle=state.obstacle,
-            obstacle_mask=state.obstacle_mask,
-            gravity=state.gravity,
-            fields={name: values.unsqueeze(1) for name, values in state.fields.items()},
-            obstacle_share=state.obstacle_share,
-            volume=state.volume,
-        )
+        frames = torch.stack([state.position - state.velocity, state.position], dim=1)
+        fields = {name: values.unsqueeze(1) for name, values in state.fields.items()}
+        return cls(frames=frames, fields=fields, **{name: getattr(state, name) for name in _SHARED})
 
     @property
     def initial(self) -> Particles:
         """The state at the window's second frame, of the particles that are there in the first two."""
         moved = self.obstacle_frames
+        there = self.mask if self.present is None else self.mask & self.present[:, 0] & self.present[:, 1]
         return Particles(
             position=self.frames[:, 1],
             velocity=self.frames[:, 1] - self.frames[:, 0],
-            material=self.material,
-            mask=self.mask if self.present is None else self.mask & self.present[:, 0] & self.present[:, 1],
-            obstacle=self.obstacle,
-            obstacle_mask=self.obstacle_mask,
-            gravity=self.gravity,
             fields={name: values[:, min(1, values.shape[1] - 1)] for name, values in self.fields.items()},
-            obstacle_share=self.obstacle_share,
             obstacle_velocity=None if moved is None else moved[:, 1] - moved[:, 0],
-            volume=self.volume,
+            **({name: getattr(self, name) for name in _SHARED} | {"mask": there}),
         )
 
     def mask_at(self, frame: int) -> Tensor:
@@ -204,10 +208,9 @@ class Window(Batched):
             for name, axis in (particles | obstacles).items()
             if getattr(self, name) is not None
         }
-        missing = -self.frames.shape[2] % multiple
+        count = self.frames.shape[2]
         larger["fields"] = {
-            name: _extended(values, 2, missing if values.shape[2] == self.frames.shape[2] else 0)
-            for name, values in self.fields.items()
+            name: _extended(v, 2, -count % multiple if v.shape[2] == count else 0) for name, v in self.fields.items()
         }
         return dataclasses.replace(self, **larger)
 
@@ -246,13 +249,19 @@ class Window(Batched):
 
 
 def _extended(values: Tensor, axis: int, by: int) -> Tensor:
-    """Values with the first along an axis repeated at its end so many times, or False in a mask."""
-    shape = list(values.shape)
-    if not by or not shape[axis]:
+    """Values with the first along an axis, if there is one, repeated at its end so many times; False in a mask."""
+    if not by:
         return values
-    shape[axis] = by
-    more = values.new_zeros(shape) if values.dtype == torch.bool else values.narrow(axis, 0, 1).expand(shape)
+    shape = [by if at == axis else extent for at, extent in enumerate(values.shape)]
+    blank = values.dtype == torch.bool or not values.shape[axis]
+    more = values.new_zeros(shape) if blank else values.narrow(axis, 0, 1).expand(shape)
     return torch.cat([values, more], dim=axis)
+
+
+def _stacked(parts: Sequence[Tensor]) -> Tensor:
+    """Tensors (B, K, …) along the first axis, extended to the largest along the second."""
+    most = max(values.shape[1] for values in parts)
+    return torch.cat([_extended(values, 1, most - values.shape[1]) for values in parts])
 
 
 def scene_volumes(volume: Tensor | None, mask: Tensor) -> Tensor | None:
@@ -266,9 +275,7 @@ def scene_volumes(volume: Tensor | None, mask: Tensor) -> Tensor | None:
     return of_scene if bool(((volume == of_scene.unsqueeze(1)) | ~mask).all()) else None
 
 
-def _check_shapes(
-    owner: Particles | Window, batch: int, count: int, dim: int, field_shapes: list[tuple[int, ...]]
-) -> None:
+def _check_shapes(owner: Particles | Window, batch: int, count: int, dim: int, fields: list[tuple[int, ...]]) -> None:
     statics = owner.obstacle.shape[1]
     expected = {
         "material": (batch, count),
@@ -276,16 +283,15 @@ def _check_shapes(
         "obstacle": (batch, statics, dim),
         "obstacle_mask": (batch, statics),
         "gravity": (batch, dim),
+        "volume": (batch, count),
+        "obstacle_share": (batch, statics),
     }
     kind = type(owner).__name__
     for name, shape in expected.items():
-        _check_shape(f"{kind}.{name}", getattr(owner, name), [shape])
-    if owner.volume is not None:
-        _check_shape(f"{kind}.volume", owner.volume, [(batch, count)])
-    if owner.obstacle_share is not None:
-        _check_shape(f"{kind}.obstacle_share", owner.obstacle_share, [(batch, statics)])
+        if (values := getattr(owner, name)) is not None:
+            _check_shape(f"{kind}.{name}", values, [shape])
     for name, values in owner.fields.items():
-        _check_shape(f"{kind}.fields[{name!r}]", values, field_shapes)
+        _check_shape(f"{kind}.fields[{name!r}]", values, fields)
 
 
 def _check_shape(name: str, values: Tensor, allowed: list[tuple[int, ...]]) -> None:

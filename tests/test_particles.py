@@ -2,8 +2,9 @@ import dataclasses
 
 import pytest
 import torch
-from scenes import box, cloud
+from scenes import box, cloud, emulator_of
 
+from nmpm.emulator import rollout
 from nmpm.particles import Particles, Window
 
 KEPT = {"material": torch.int64, "mask": torch.bool, "obstacle_mask": torch.bool}
@@ -32,6 +33,24 @@ def test_some_scenes_are_views(whole):
     for name, values in tensors(some).items():
         assert torch.equal(values, tensors(whole)[name][1:])
         assert values.untyped_storage().data_ptr() == tensors(whole)[name].untyped_storage().data_ptr()
+
+
+def test_stacked_states_of_any_size_move_as_alone():
+    scene = box(materials=("water", "sand"), obstacles=True)
+    emulator = emulator_of(scene, energy=True, density_cap=0.3)
+    states = [cloud(scene, 300, 2), cloud(scene, 7, statics=5), cloud(scene, 90, seed=1, statics=9)]
+    whole = Particles.stack(states)
+    assert whole.mask.sum(1).tolist() == [300, 300, 7, 90]
+    assert whole.obstacle_mask.sum(1).tolist() == [0, 0, 5, 9]
+    path = rollout(emulator, whole, 6)
+    for first, each in zip((0, 2, 3), states, strict=True):
+        batch, count = each.mask.shape
+        torch.testing.assert_close(
+            path[first : first + batch, :, :count], rollout(emulator, each, 6), rtol=0, atol=1e-6
+        )
+    warm = dataclasses.replace(states[0], fields={"heat": torch.zeros(2, 300)})
+    with pytest.raises(ValueError, match="the fields heat"):
+        Particles.stack([warm, states[1]])
 
 
 def test_a_window_of_a_state_starts_there_and_predicts_nothing():

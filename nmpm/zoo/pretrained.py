@@ -277,7 +277,7 @@ class Pretrained:
         """Predict positions (B, frames, N, D) in domain length from a state, whose own frame is not among them.
 
         Args:
-            state: From `state`, or a window's `initial`.
+            state: From `state`, or a window's `initial`; several of any size at once by `Particles.stack`.
             frames: How many.
             prescribed: Obstacles that move, `Prescribed.obstacles(positions)`, or particles that enter and leave too,
                 `Prescribed.of(window)`. Positions of particles that are not there are NaN, as are those of particles
