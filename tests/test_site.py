@@ -95,7 +95,7 @@ def test_what_runs_where_is_the_table_of_the_engines():
     page = load_hook("pages").engines_page()
     for rule in (*rules.MODELS, *rules.CALLS):
         marks = " | ".join("✓" if name in rule.engines else "" for name in rules.FASTER)
-        assert f"| {rule.feature} | {marks} |" in page
+        assert f"| {rule.feature} | ✓ | {marks} |" in page
     assert all(f"- {rule.feature}" in page for rule in rules.RECORDINGS)
 
 

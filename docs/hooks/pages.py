@@ -105,6 +105,7 @@ def configuration_page() -> str:
 
 def engines_page() -> str:
     """What runs where, by the tables of `nmpm.emulator.engines.rules`."""
+    engines = ("torch", *rules.FASTER)
     tried = "\n".join(f"| {name} | {where} |" for name, where in rules.TRIED.items())
     refusals = "\n".join(f"- {rule.feature}" for rule in rules.RECORDINGS)
     return (
@@ -114,8 +115,8 @@ def engines_page() -> str:
         " is torch's, with the same result to rounding. The *network* between is run by torch, or by a *runtime* that"
         " is asked for (`model.optimized()`, `--runtime`). `model.explain()` and `nmpm zoo card NAME` say what this"
         " means for a model here.\n\n"
-        f"## Engines: models\n\n{_table(rules.MODELS, rules.FASTER)}\n\n"
-        f"## Engines: calls\n\n{_table(rules.CALLS, rules.FASTER)}\n\n"
+        f"## Engines: models\n\n{_table(rules.MODELS, engines)}\n\n"
+        f"## Engines: calls\n\n{_table(rules.CALLS, engines)}\n\n"
         "## CUDA graphs\n\n"
         "On a CUDA GPU rollouts' calls are recorded when a shape of state comes again, and replayed from then on."
         f" Not recorded are shapes that change with each call, and:\n\n{refusals}\n\n"
@@ -128,9 +129,9 @@ def engines_page() -> str:
 
 
 def _table(rows: Sequence[rules.Rule[Any]], columns: Sequence[str]) -> str:
-    """Features, and a mark for each column that takes them."""
+    """Features, and a mark for each column that takes them, as torch does."""
     lines = [["feature", *columns], ["---", *([":-:"] * len(columns))]]
-    lines += [[rule.feature, *("✓" if name in rule.engines else "" for name in columns)] for rule in rows]
+    lines += [[rule.feature, *("✓" if name in ("torch", *rule.engines) else "" for name in columns)] for rule in rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 

@@ -74,6 +74,8 @@ def test_without_a_faster_one_it_is_torch(model, monkeypatch):
     assert isinstance(model.optimized("eager").emulator.runtime, Eager)
     with pytest.raises(ConfigError, match=r"pip install \"nmpm\[openvino\]\""):
         model.optimized("openvino")
+    with pytest.warns(UserWarning, match="runtime cuda-graph is now part of eager"):
+        assert isinstance(model.optimized("cuda-graph").emulator.runtime, Eager)
     with pytest.raises(ConfigError, match="No runtime is called 'fast'"):
         model.optimized("fast")
 

@@ -10,6 +10,7 @@ import importlib.util
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Generic, TypeVar
 
@@ -143,7 +144,7 @@ CALLS: tuple[Rule[Call], ...] = (
     Rule("gradients of gravity or obstacles", (), lambda call: _need_gradients((call.particles.gravity, call.solid))),
     Rule(
         "gradients of a rollout", ("numba training", "triton training"),
-        lambda call: _need_gradients((*call.motion, *call.emulator.parameters())),
+        lambda call: _need_gradients(chain(call.motion, call.emulator.parameters())),
     ),
     Rule(
         "a recorded training step, which moves its grid", ("triton training",),
