@@ -9,7 +9,7 @@ grid's rates of a bundle's frames, s_i = s_{i-1} + g2p(r_i)(x_{i-1}), so that no
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -18,9 +18,6 @@ from nmpm._support.collectives import all_gather
 from nmpm.errors import DataError
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
-
-Gather = Callable[[Tensor, Tensor], Tensor]
-"""Interpolates a grid's rates (B, materials * E, *S) at (B, N, D) positions in cells, (B, N, E)."""
 
 
 class FieldScales(nn.Module):
@@ -55,6 +52,8 @@ class FieldScales(nn.Module):
     def of_particles(self, particles: Particles) -> Tensor:
         """(B, N, P) the particles' fields in units of their spread; 0 for padding."""
         batch, count = particles.mask.shape
+        if not self.scene.particle_fields:
+            return torch.empty(batch, count, 0)
         columns = [self._scaled(name, particles).expand(batch, count) for name in self.scene.particle_fields]
         return torch.stack(columns, -1).masked_fill(~particles.mask.unsqueeze(-1), 0.0)
 
@@ -68,6 +67,8 @@ class FieldScales(nn.Module):
                 raise DataError(
                     f"The model was trained with one {name} for each trajectory; the state has one for each particle."
                 )
+        if not self.scene.parameters:
+            return torch.empty(len(particles.mask), 0)
         return torch.cat([self._scaled(name, particles) for name in self.scene.parameters], dim=1)
 
     def _scaled(self, name: str, particles: Particles) -> Tensor:
@@ -77,19 +78,16 @@ class FieldScales(nn.Module):
             return self.mean.new_zeros(len(particles.mask), 1)
         return (particles.fields[name].to(self.mean.dtype) - self.mean[index]) / self.std[index]
 
-    def evolve(self, particles: Particles, places: Tensor, rates: Tensor, gather: Gather) -> Mapping[str, Tensor]:
-        """The evolving fields in the frames of a bundle, (B, m, N) by name, from their values at its start.
+    def evolve(self, begun: Mapping[str, Tensor], gained: Tensor) -> Mapping[str, Tensor]:
+        """The evolving fields in the frames of a bundle, (B, m, N) by name, from those at its start.
 
-        `gather` interpolates the predicted rates (B, m, materials * E, *S), in units of the fields' spread per frame,
-        at the places (B, m, N, D) in cells before each frame's step.
+        `gained` (B, m, N, E) are the sums of the rates since then, in units of the fields' spread.
         """
-        batch, count = particles.mask.shape
-        steps = [gather(rate, cells) for rate, cells in zip(rates.unbind(1), places.unbind(1), strict=True)]
-        gained = torch.stack(steps, dim=1).cumsum(1)
+        batch, _, count, _ = gained.shape
         fields = {}
         for index, name in enumerate(self.scene.evolving):
-            begun = particles.fields.get(name, self.mean[index].expand(batch, 1)).expand(batch, count).unsqueeze(1)
-            fields[name] = begun + (self.std[index] * gained[..., index]).to(begun.dtype)
+            first = begun.get(name, self.mean[index].expand(batch, 1)).expand(batch, count).unsqueeze(1)
+            fields[name] = first + (self.std[index] * gained[..., index]).to(first.dtype)
         return fields
 
 

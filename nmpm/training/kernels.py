@@ -73,11 +73,12 @@ class Counts(torch.autograd.Function):
         """
         counts = np.zeros((*cells.shape[:2], grid.size, materials), np.float32)
         none, kinds = np.empty((cells.shape[2], 0), np.float32), material_rows(material, materials)
+        space = (grid.shape, grid.periodic, _LINEAR)
 
         def add(b: int) -> None:
             kind, real, here = kinds[b], as_array(mask[b]), as_array(cells[b])
             for frame in range(len(here)):
-                scatter(none, kind, real, here[frame], grid.shape, grid.periodic, _LINEAR, counts[b, frame])
+                scatter(none, kind, real, here[frame], space, counts[b, frame])
 
         for_each(add, len(cells), torch.get_num_threads())
         ctx.save_for_backward(cells, material, mask)
@@ -92,13 +93,13 @@ class Counts(torch.autograd.Function):
         grid: Grid = ctx.grid
         gradient, pull = np.zeros(cells.shape, np.float32), as_array(slope)
         none, kinds = np.empty((cells.shape[2], 0), np.float32), material_rows(material, slope.shape[-1])
+        space = (grid.shape, grid.periodic, _LINEAR)
 
         def follow(b: int) -> None:
             kind, real, here = kinds[b], as_array(mask[b]), as_array(cells[b])
             for frame in range(len(here)):
                 scatter_adjoint(
-                    none, kind, real, here[frame], grid.shape, grid.periodic, _NONE, pull[b, frame], gradient[b, frame],
-                    none,
+                    none, kind, real, here[frame], space, _NONE, pull[b, frame], gradient[b, frame], none
                 )  # fmt: skip
 
         for_each(follow, len(cells), torch.get_num_threads())

@@ -21,7 +21,7 @@ from torch import Tensor
 from nmpm.grid import Grid
 from nmpm.transfer.execution import add, chunks
 
-_LEAST_SHARE = 1e-30  # of a particle
+LEAST_SHARE = 1e-30  # of a particle
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def gather(stencil: Stencil, field: Tensor) -> Tensor:
 
 def divisors(count: Tensor) -> Tensor:
     """Numbers of particles, and 1 where so small a share of one is seen that gradients of quotients would overflow."""
-    return torch.where(count > _LEAST_SHARE, count, 1.0)
+    return torch.where(count > LEAST_SHARE, count, 1.0)
 
 
 def tensor_product(base: Tensor, weights: list[Tensor], grid: Grid) -> Stencil:

@@ -36,12 +36,35 @@ def scene_of(dim, walls, materials=1, obstacles=False, slim=False):
     return scene
 
 
+FIELDS = {"evolving": ("temperature", "salt"), "properties": ("stiffness",), "parameters": ("friction",)}
+
+
+def with_extras(scene, particles, fields=False, moving=False, sizes=False):
+    """The scene and the state with fields of particles and scenes, obstacles that move, or several sizes."""
+    generator = torch.Generator().manual_seed(0)
+
+    def random(*shape):
+        return torch.rand(*shape, generator=generator)
+
+    batch, count = particles.mask.shape
+    if fields:
+        scene = dataclasses.replace(scene, **FIELDS)
+        given = {"temperature": random(batch, count), "stiffness": random(batch, count), "friction": random(batch, 1)}
+        particles = particles.with_fields(given)  # without salt
+    if moving:
+        scene, speeds = dataclasses.replace(scene, moving_obstacles=True), random(*particles.obstacle.shape)
+        particles = dataclasses.replace(particles, obstacle_velocity=0.02 * (speeds - 0.5))
+    if sizes:
+        particles = dataclasses.replace(particles, volume=0.5 + random(batch, count))
+    return scene, particles
+
+
 def engine_of(emulator, particles):
     return find_engine(emulator, particles, emulator.solid(particles)).name
 
 
 def predict_both(emulator, particles):
-    """A bundle's last positions and velocities in cells, by kernels and by tensor operations."""
+    """A bundle's last positions and velocities in cells, and fields, by kernels and by tensor operations."""
     with torch.no_grad():
         assert engine_of(emulator, particles) == "numba"
         fused = emulator(particles)
@@ -49,7 +72,15 @@ def predict_both(emulator, particles):
             assert engine_of(emulator, particles) == "torch"
             tensors = emulator(particles)
     spacing = torch.tensor(emulator.grid.spacing)
-    return [torch.stack([b.position[:, -1], b.velocity]) / spacing for b in (fused, tensors)]
+    assert fused.fields.keys() == tensors.fields.keys()
+    return [
+        torch.cat([torch.stack([bundle.position[:, -1], bundle.velocity]) / spacing, *_last_fields(bundle)], dim=-1)
+        for bundle in (fused, tensors)
+    ]
+
+
+def _last_fields(bundle):
+    return [values[:, -1, :, None].expand(2, -1, -1, -1) for values in bundle.fields.values()]
 
 
 def share_that_differs(emulator, particles) -> float:
@@ -74,9 +105,9 @@ def test_shipped_models_with_their_constraints(name):
     assert share_that_differs(emulator, particles) <= (0.01 if flat else 0.02)
 
 
-def case(dim, walls, transfer, decoder, bounds="stop", materials=1, obstacles=False, slim=False, **held):
+def case(dim, walls, transfer, decoder, bounds="stop", materials=1, obstacles=False, slim=False, extras=(), **held):
     parts = {"transfer": transfer, "decoder": decoder, "bounds": bounds} | held
-    return scene_of(dim, walls, materials, obstacles, slim), parts
+    return scene_of(dim, walls, materials, obstacles, slim), extras, parts
 
 
 CASES = {
@@ -86,7 +117,15 @@ CASES = {
     "crowded": case(2, (False, True), Linear(), Absolute(), materials=3, energy=True, density_cap=0.3),
     "slim cells": case(2, (True, True), Quadratic(), Acceleration(), slim=True, density_cap=0.3, **HELD),
     "obstacles": case(2, (True, True), Linear(), Residual(), obstacles=True, density_cap=0.3, **HELD),
+    "fields": case(2, (True, True), Linear(), Residual(), materials=2, extras=("fields",), **HELD),
+    "fields and sizes": case(
+        2, (False, True), Nearest(), Blend(0.8), extras=("fields", "sizes"), density_cap=0.3, **HELD
+    ),
+    "moving obstacles": case(
+        2, (True, True), Linear(), Flip(), obstacles=True, extras=("moving", "sizes"), density_cap=0.3, **HELD
+    ),
     "3-D": case(3, (True, True, False), Linear(), Flip(), "reflect", 2, energy=True, density_cap=0.3),
+    "3-D, fields": case(3, (True, True, False), Quadratic(), Flip(), materials=2, extras=("fields", "sizes")),
     "3-D, quadratic": case(3, (False, True, True), Quadratic(), Acceleration(), rest_speed=0.05),
     "3-D, obstacles": case(3, (True, True, True), Linear(), Residual(), obstacles=True, density_cap=0.3, **HELD),
 }
@@ -94,8 +133,9 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_bundles(name):
-    scene, parts = CASES[name]
+    scene, extras, parts = CASES[name]
     particles = cloud(scene, 400, 2, 0.02, statics=20 * scene.obstacles)
+    scene, particles = with_extras(scene, particles, **dict.fromkeys(extras, True))
     particles.mask[1, 200:] = False
     assert share_that_differs(emulator_of(scene, cells=12, **parts), particles) <= 0.02
 
@@ -107,16 +147,19 @@ def test_bundles(name):
     bounds=st.sampled_from(["stop", "reflect"]), energy=st.booleans(), cap=st.sampled_from([0.0, 0.3, 2.0]),
     rest=st.sampled_from([0.0, 0.05]), speed=st.sampled_from([0.0, 0.002, 0.05, 0.3]),
     scale=st.sampled_from([0.1, 1.0, 5.0]), count=st.sampled_from([0, 1, 17, 700]), batch=st.integers(1, 2),
-    slim=st.booleans(), statics=st.sampled_from([0, 5, 30]), seed=st.integers(0, 1000),
+    slim=st.booleans(), statics=st.sampled_from([0, 5, 30]), seed=st.integers(0, 1000), fields=st.booleans(),
+    moving=st.booleans(), sizes=st.booleans(),
 )  # fmt: skip
 @settings(max_examples=80)
 def test_bundles_of_any_kind(
-    dim, walls, materials, transfer, decoder, bounds, energy, cap, rest, speed, scale, count, batch, slim, statics, seed
-):
+    dim, walls, materials, transfer, decoder, bounds, energy, cap, rest, speed, scale, count, batch, slim, statics,
+    seed, fields, moving, sizes,
+):  # fmt: skip
     walls, obstacles = [True] * 3 if statics else walls, statics > 0
     held = {"energy": energy, "rest_speed": rest, "density_cap": cap}
-    scene, parts = case(dim, walls, transfer, decoder, bounds, materials, obstacles, slim and not obstacles, **held)
+    scene, _, parts = case(dim, walls, transfer, decoder, bounds, materials, obstacles, slim and not obstacles, **held)
     particles = cloud(scene, count, batch, speed, seed, statics)
+    scene, particles = with_extras(scene, particles, fields, moving and obstacles, sizes)
     if batch > 1 and count:
         particles.mask[1, count // 2 :] = False
     share = share_that_differs(emulator_of(scene, cells=12, scale=scale, seed=seed, **parts), particles)
@@ -276,22 +319,28 @@ def train_once(emulator, particles):
     """Loss, predicted positions, and gradients with respect to the state and all weights, over two bundles."""
     torch.manual_seed(1)
     position, velocity = (values.clone().requires_grad_() for values in (particles.position, particles.velocity))
-    state, paths = particles.with_motion(position, velocity), []
+    fields = {name: values.clone().requires_grad_(values.shape[1] > 1) for name, values in particles.fields.items()}
+    state, paths = particles.with_motion(position, velocity).with_fields(fields), []
     for _ in range(2):
         bundle = emulator(state)
-        state = state.with_motion(bundle.position[:, -1], bundle.velocity)
+        state = bundle.state_after(state)
         paths.append(bundle.position)
     predicted = torch.cat(paths, dim=1)
     shift = 0.01 * torch.arange(-1, predicted.shape[1] + 1).clamp(min=0).view(1, -1, 1, 1)
-    window = window_of(particles, particles.position.unsqueeze(1) + shift)
+    window = window_of(dataclasses.replace(particles, fields={}), particles.position.unsqueeze(1) + shift)
     loss = TrainingError(4.0, 0.5)(predicted, window, emulator.scene, emulator.grid, emulator.frames)
-    gradients = torch.autograd.grad(loss, [position, velocity, *emulator.parameters()], allow_unused=True)
+    real = particles.mask.unsqueeze(1)
+    loss = loss + sum((values * real).square().mean() for values in bundle.fields.values())
+    leaves = [position, velocity, *(values for values in fields.values() if values.requires_grad)]
+    gradients = torch.autograd.grad(loss, [*leaves, *emulator.parameters()], allow_unused=True)
     return loss, predicted, [torch.zeros(()) if each is None else each for each in gradients]
 
 
-def check_training(walls, materials, decoder, obstacles, count, seed=0, speed=0.005, sizes=None):
+def check_training(walls, materials, decoder, obstacles, count, seed=0, speed=0.005, sizes=None, extras=False):
     scene = scene_of(2, walls, materials, obstacles)
-    emulator, particles = trained(scene, seed, decoder=decoder), cloud(scene, count, 2, speed, seed, 5 * obstacles)
+    particles = cloud(scene, count, 2, speed, seed, 5 * obstacles)
+    scene, particles = with_extras(scene, particles, extras, extras and obstacles)
+    emulator = trained(scene, seed, decoder=decoder)
     particles.mask[1, (count + 1) // 2 :] = False
     if sizes is not None:
         volume = torch.where(particles.mask, torch.tensor(sizes).unsqueeze(1), 1.0)
@@ -321,6 +370,11 @@ def test_training_has_the_same_values_and_gradients(walls, materials, decoder, o
     check_training(walls, materials, decoder, obstacles, 200, speed=speed)
 
 
+@pytest.mark.parametrize(("materials", "obstacles"), [(2, False), (1, True)])
+def test_fields_and_moving_obstacles_have_gradients_in_training(materials, obstacles):
+    check_training((True, True), materials, Residual(), obstacles, 200, extras=True)
+
+
 def test_scenes_may_have_particles_of_a_size_of_their_own_in_training():
     check_training((True, True), 2, Residual(), True, 100, sizes=(0.4, 2.5))
     several = dataclasses.replace(cloud(box(), 10), volume=torch.linspace(1.0, 2.0, 10).expand(1, -1))
@@ -330,11 +384,11 @@ def test_scenes_may_have_particles_of_a_size_of_their_own_in_training():
 @pytest.mark.slow
 @given(
     walls=st.tuples(st.booleans(), st.booleans()), materials=st.integers(1, 3), decoder=st.sampled_from(DECODERS),
-    obstacles=st.booleans(), count=st.sampled_from([1, 17, 300]), seed=st.integers(0, 1000),
+    obstacles=st.booleans(), count=st.sampled_from([1, 17, 300]), seed=st.integers(0, 1000), extras=st.booleans(),
 )  # fmt: skip
 @settings(max_examples=20)
-def test_trainings_of_any_kind(walls, materials, decoder, obstacles, count, seed):
-    check_training(walls, materials, decoder, obstacles, count, seed)
+def test_trainings_of_any_kind(walls, materials, decoder, obstacles, count, seed, extras):
+    check_training(walls, materials, decoder, obstacles, count, seed, extras=extras)
 
 
 def test_padding_gets_no_gradient_and_changes_none():

@@ -286,11 +286,8 @@ def test_two_particles_in_one_place_are_one_of_twice_the_size():
     )
 
 
-def test_what_has_no_kernels_or_programs_is_refused_with_the_reason():
+def test_what_has_no_programs_is_refused_with_the_reason():
     moving, opened = emulator_of(PADDLE), emulator_of(box(**OPEN))
-    assert not moving.engines
-    assert opened.engines
-    assert not emulator_of(box(**OPEN), rest_speed=0.1).engines
     for emulator, what in ((moving, "obstacles that move"), (opened, "open axes")):
         with pytest.raises(ConfigError, match=f"exported files do not carry: {what}: use it in Python"):
             Network(emulator)

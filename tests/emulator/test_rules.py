@@ -56,7 +56,9 @@ CHANGES = {
     "moving obstacles in the state": lambda *_: changed(_[-1], obstacle_velocity=torch.zeros_like(_[-1].obstacle)),
     "sizes of particles": lambda *_: changed(_[-1], volume=2 * torch.ones(_[-1].mask.shape)),
     "several sizes in a scene": lambda *_: changed(_[-1], volume=1 + torch.rand(_[-1].mask.shape)),
-    "gradients of gravity or obstacles": lambda *_: changed(_[-1], gravity=_[-1].gravity.clone().requires_grad_()),
+    "gradients of gravity, obstacles or numbers of a scene": lambda *_: changed(
+        _[-1], gravity=_[-1].gravity.clone().requires_grad_()
+    ),
     "gradients of a rollout": lambda *_: changed(_[-1], velocity=_[-1].velocity.clone().requires_grad_()),
     "a recorded training step, which moves its grid": lambda _, emulator, state: setattr(
         emulator, "grid", MovedGrid(**vars(emulator.grid))

@@ -11,6 +11,7 @@ All engines compute the same, to rounding; the torch engine is the reference.
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -76,6 +77,17 @@ class Engine(ABC, Generic[Start, Values]):
         """The network's output (B, m, C_out, *S), of its own precision and scale, for what it sees (B, C_in, *S)."""
         emulator = self.emulator
         return emulator.runtime.fields(emulator.processor, seen, emulator.network_precision)
+
+    def solids_ahead(self, particles: Particles) -> Tensor | None:
+        """(B, m, *S) solid fraction at each frame, of obstacles that keep their velocity; None where none moves."""
+        model, velocity = self.emulator, particles.obstacle_velocity
+        if velocity is None or model.training or not (model.scene.obstacles and model.constraints.solids):
+            return None
+        at_frames = (
+            dataclasses.replace(particles, obstacle=particles.obstacle + frame * velocity)
+            for frame in range(1, model.frames + 1)
+        )
+        return torch.cat([model.solid(there) for there in at_frames], dim=1)
 
     @abstractmethod
     def rasterise(self, particles: Particles, context: RolloutContext) -> Start:

@@ -73,6 +73,14 @@ class Call:
         return self.particles.position, self.particles.velocity
 
     @property
+    def surroundings(self) -> tuple[Tensor, ...]:
+        """Gravity, solids and numbers of the scenes."""
+        state = self.particles
+        numbers = (values for values in state.fields.values() if values.shape[1] == 1)
+        moving = () if state.obstacle_velocity is None else (state.obstacle_velocity,)
+        return (state.gravity, self.solid, *moving, *numbers)
+
+    @property
     def is_float32(self) -> bool:
         given = (*self.motion, self.particles.gravity)
         return self.emulator.precision == torch.float32 and all(each.dtype == torch.float32 for each in given)
@@ -113,8 +121,8 @@ MODELS: tuple[Rule[EmulatorRecipe], ...] = (
     # Beside the kernels torch's strided 3-D convolutions in bfloat16 sometimes got weights' gradients of unset memory
     # (torch 2.13, CPU with AVX-512), which they do not beside tensor operations: no training.
     Rule("three dimensions", ("numba",), lambda recipe: recipe.scene.dim == 3),
-    Rule("fields", (), lambda recipe: bool(recipe.scene.fields)),
-    Rule("obstacles that move", (), lambda recipe: recipe.scene.moving_obstacles),
+    Rule("fields", ("numba", "numba training"), lambda recipe: bool(recipe.scene.fields)),
+    Rule("obstacles that move", ("numba", "numba training"), lambda recipe: recipe.scene.moving_obstacles),
     Rule("rest beside open axes", (), lambda r: "open" in r.scene.boundary and r.constraints.rest_speed > 0),
     # Subclasses may do something else, so exactly these count.
     Rule(
@@ -135,16 +143,21 @@ CALLS: tuple[Rule[Call], ...] = (
     Rule("rollouts", ("numba", "triton"), lambda call: not call.emulator.training),
     Rule("trainings", ("numba training", "triton training"), lambda call: call.emulator.training),
     Rule("float64", (), lambda call: not call.is_float32),
-    Rule("moving obstacles in the state", (), lambda call: call.particles.obstacle_velocity is not None),
     Rule(
-        "sizes of particles", ("numba training", "triton", "triton training"),
+        "moving obstacles in the state", ("numba", "numba training"),
+        lambda call: call.particles.obstacle_velocity is not None,
+    ),
+    Rule(
+        "sizes of particles", ("numba", "numba training", "triton", "triton training"),
         lambda call: call.particles.volume is not None,
     ),
-    Rule("several sizes in a scene", ("triton", "triton training"), lambda call: call.sizes_differ),
-    Rule("gradients of gravity or obstacles", (), lambda call: _need_gradients((call.particles.gravity, call.solid))),
+    Rule("several sizes in a scene", ("numba", "triton", "triton training"), lambda call: call.sizes_differ),
+    Rule("gradients of gravity, obstacles or numbers of a scene", (), lambda call: _need_gradients(call.surroundings)),
     Rule(
         "gradients of a rollout", ("numba training", "triton training"),
-        lambda call: _need_gradients(chain(call.motion, call.emulator.parameters())),
+        lambda call: _need_gradients(
+            chain(call.motion, call.particles.fields.values(), call.emulator.parameters())
+        ),
     ),
     Rule(
         "a recorded training step, which moves its grid", ("triton training",),

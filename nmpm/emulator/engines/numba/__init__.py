@@ -7,17 +7,19 @@ everywhere.
 
 Kernels take the arrays of one scene, C-contiguous and of float32 unless said otherwise, in cells and cells per frame:
 
-    cells, velocity   (N, D) positions and velocities at the bundle's start
+    path              (m + 1, N, D) positions at the bundle's start and in each frame
+    velocity          (N, D) velocities at the start
     material          (N,) int64; empty where there is only one
     mask              (N,) bool, False for padding
     mass              (N,) each particle's share of the scene's mass, 0 for padding
     gravity           (D,) what a frame adds to a velocity
     state             (size, C_in) the grid state: velocities, volume fractions, solid, constants
     fields            (m, size, C) velocities that the network predicts, C = materials * D
-    path              (m, N, D) positions at each frame
+    rates             (m, size, C) rates of the particles' evolving fields, C = materials * E
+    volume            (N,) volume of each particle as a multiple of the scene's; empty where they have that
     obstacle          (size,) share of each cell's room that is obstacle; empty where there are no obstacles
-    grid              tuple (shape, wraps) of the cells along each axis and whether it is periodic; for transfers also
-                      `steps`, as long as the transfer has nodes along an axis
+    grid              tuple (shape, wraps, steps) of the cells along each axis, whether it is periodic, and a tuple as
+                      long as the transfer has nodes along an axis
     bounds            (3, D) lowest and highest positions, infinite on periodic axes; 1 in the last row to reflect
     ratio             (D,) widths of the cells over that of the first axis
     low, high         the range of particles that the call treats, so that threads share a scene

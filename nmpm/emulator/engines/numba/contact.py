@@ -6,6 +6,7 @@ Particles that touch an obstacle are marked, then only those are followed piece 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -13,10 +14,10 @@ import numpy as np
 
 from nmpm._support.jit import jit
 from nmpm._support.threads import map_ranges, split
+from nmpm.emulator.engines.numba.gather import depths
 from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
-from nmpm.emulator.engines.numba.path import BLOCK, CHUNK, confine
-from nmpm.emulator.engines.numba.solids import SolidCache, cell_index, depths
-from nmpm.emulator.engines.numba.state import StartArrays
+from nmpm.emulator.engines.numba.path import BLOCK, CHUNK, confine, confine_all
+from nmpm.emulator.engines.numba.solids import SolidCache, cell_index
 from nmpm.emulator.engines.torch.contact import SURFACE
 
 PIECE, EVEN = 0.5, 1e-5  # as in the torch engine's `contact`
@@ -27,22 +28,33 @@ _WAYS_OUT = 4
 ZERO, ONE, _INFINITE = np.float32(0), np.float32(1), np.float32(np.inf)
 
 
-def keep_clear(start: StartArrays, parameters: KernelParameters, solids: SolidCache, path: Array, threads: int) -> None:
+def keep_clear(path: Array, mask: Array, parameters: KernelParameters, solids: SolidCache, threads: int) -> None:
     """Change the path of a scene so that it keeps clear of obstacles, within the bounds."""
-    ranges, grid, obstacle = split(len(start.cells), CHUNK), parameters.grid, solids.obstacle
-    pieces = _count_pieces(map_ranges(partial(longest_step, start.cells, path, start.mask), ranges, threads))
-    marks = np.empty(len(start.cells), np.int8)
-    find = partial(mark, start.cells, path, start.mask, obstacle, solids.clearance, grid, pieces, marks)
+    ranges, grid, obstacle = split(len(mask), CHUNK), parameters.grid, solids.obstacle
+    pieces = _count_pieces(map_ranges(partial(longest_step, path, mask), ranges, threads))
+    marks = np.empty(len(mask), np.int8)
+    find = partial(mark, path, mask, obstacle, solids.clearance, grid, pieces, marks)
     if not sum(map_ranges(find, ranges, threads)):
         return
     rows = np.flatnonzero(marks)
     free = np.empty(len(rows), np.int64)
     place, along = np.empty((2, len(rows), len(parameters.shape)), np.float32)
-    longest = follow(start.cells, path, obstacle, grid, pieces, rows, free, place, along)
+    longest = follow(path, obstacle, grid, pieces, rows, free, place, along)
     slide(path, obstacle, grid, parameters.bounds, pieces, _count_pieces([longest]), rows, free, place, along)
     stuck = np.flatnonzero(marks == STUCK)
     if len(stuck):
-        push_out(start.cells, path, obstacle, grid, parameters.bounds, stuck)
+        push_out(path, obstacle, grid, parameters.bounds, stuck)
+
+
+def keep_clear_of_moving(
+    path: Array, mask: Array, parameters: KernelParameters, ahead: Sequence[SolidCache], threads: int
+) -> None:
+    """`keep_clear` of obstacles that are elsewhere in each frame, frame by frame."""
+    steps = np.diff(path, axis=0)
+    for frame, solids in enumerate(ahead):
+        np.add(path[frame], steps[frame], out=path[frame + 1])
+        keep_clear(path[frame : frame + 2], mask, parameters, solids, threads)
+        confine_all(path[frame + 1, : len(mask)], parameters.bounds)
 
 
 def _count_pieces(lengths: list[float]) -> int:
@@ -51,12 +63,11 @@ def _count_pieces(lengths: list[float]) -> int:
 
 
 @jit
-def longest_step(cells: Any, path: Any, mask: Any, low: Any, high: Any) -> Any:
+def longest_step(path: Any, mask: Any, low: Any, high: Any) -> Any:
     """Length of the longest step in a frame; steps of padding, and those that are not finite, do not count."""
     longest, real = ZERO, mask[low:high]
-    for frame in range(len(path)):
-        here = path[frame, low:high]
-        before = path[frame - 1, low:high] if frame > 0 else cells[low:high]
+    for frame in range(1, len(path)):
+        here, before = path[frame, low:high], path[frame - 1, low:high]
         for p in range(len(here)):
             square = ZERO
             for d in range(here.shape[1]):
@@ -67,18 +78,18 @@ def longest_step(cells: Any, path: Any, mask: Any, low: Any, high: Any) -> Any:
 
 
 @jit
-def _find_near(cells: Any, path: Any, mask: Any, clearance: Any, grid: Any, begin: Any, end: Any, near: Any) -> Any:
+def _find_near(path: Any, mask: Any, clearance: Any, grid: Any, begin: Any, end: Any, near: Any) -> Any:
     """Fill in which particles but padding may touch an obstacle, in order, and return how many."""
     count = 0
-    furthest, start = np.zeros(end - begin, np.float32), cells[begin:end]
-    for frame in range(len(path)):
+    furthest, start = np.zeros(end - begin, np.float32), path[0, begin:end]
+    for frame in range(1, len(path)):
         here = path[frame, begin:end]
-        for d in range(cells.shape[1]):
+        for d in range(path.shape[2]):
             for p in range(len(here)):
                 way = abs(here[p, d] - start[p, d])
                 furthest[p] = furthest[p] if way <= furthest[p] else way  # NaN is far
     for p in range(begin, end):
-        if mask[p] and not furthest[p - begin] <= clearance[cell_index(cells, grid, p)] - ONE:
+        if mask[p] and not furthest[p - begin] <= clearance[cell_index(path[0], grid, p)] - ONE:
             near[count] = p
             count += 1
     return count
@@ -86,31 +97,29 @@ def _find_near(cells: Any, path: Any, mask: Any, clearance: Any, grid: Any, begi
 
 @jit
 def mark(
-    cells: Any, path: Any, mask: Any, obstacle: Any, clearance: Any, grid: Any, pieces: Any, marks: Any, low: Any,
-    high: Any,
-) -> Any:  # fmt: skip
+    path: Any, mask: Any, obstacle: Any, clearance: Any, grid: Any, pieces: Any, marks: Any, low: Any, high: Any
+) -> Any:
     """Fill in which particles touch an obstacle (`TOUCHES`) or start in one (`STUCK`), and return how many do."""
-    dim, touching = cells.shape[1], 0
+    dim, touching = path.shape[2], 0
     places, values = np.empty((BLOCK, dim), np.float32), np.empty(BLOCK, np.float32)
     near = np.empty(BLOCK, np.int64)
     marks[low:high] = CLEAR
     for begin in range(low, high, BLOCK):
-        count = _find_near(cells, path, mask, clearance, grid, begin, min(begin + BLOCK, high), near)
+        count = _find_near(path, mask, clearance, grid, begin, min(begin + BLOCK, high), near)
         for k in range(count):
             for d in range(dim):
-                places[k, d] = cells[near[k], d]
+                places[k, d] = path[0, near[k], d]
         depths(obstacle, places[:count], grid, values)
         for k in range(count):
             marks[near[k]] = STUCK if values[k] > SURFACE else CLEAR
-        for frame in range(len(path)):
+        for frame in range(1, len(path)):
             for piece in range(pieces):
                 part = np.float32(piece) / np.float32(pieces)
                 for k in range(count):
                     p = near[k]
                     for d in range(dim):
                         here = path[frame, p, d]
-                        before = path[frame - 1, p, d] if frame > 0 else cells[p, d]
-                        places[k, d] = here - (here - before) * part
+                        places[k, d] = here - (here - path[frame - 1, p, d]) * part
                 depths(obstacle, places[:count], grid, values)
                 for k in range(count):
                     if values[k] > SURFACE and marks[near[k]] == CLEAR:
@@ -121,9 +130,7 @@ def mark(
 
 
 @jit
-def follow(
-    cells: Any, path: Any, obstacle: Any, grid: Any, pieces: Any, rows: Any, free: Any, place: Any, along: Any
-) -> Any:
+def follow(path: Any, obstacle: Any, grid: Any, pieces: Any, rows: Any, free: Any, place: Any, along: Any) -> Any:
     """Find where particles first get too deep into an obstacle.
 
     Args:
@@ -136,7 +143,7 @@ def follow(
     Returns:
         The length of the longest rest; those that are not finite do not count.
     """
-    frames, dim, longest = len(path), cells.shape[1], ZERO
+    frames, dim, longest = len(path) - 1, path.shape[2], ZERO
     points, values = np.empty((frames * pieces, dim), np.float32), np.empty(frames * pieces, np.float32)
     inward, last = np.empty(dim, np.float32), frames * pieces - 1
     for row in range(len(rows)):
@@ -144,18 +151,18 @@ def follow(
         for k in range(frames * pieces):
             frame, part = k // pieces, np.float32(k % pieces + 1) / np.float32(pieces)
             for d in range(dim):
-                before = path[frame - 1, p, d] if frame > 0 else cells[p, d]
-                points[k, d] = before + (path[frame, p, d] - before) * part
+                before = path[frame, p, d]
+                points[k, d] = before + (path[frame + 1, p, d] - before) * part
         depths(obstacle, points, grid, values)
         free[row] = _first_deep(values, len(points))
         _point_inward(obstacle, points[min(free[row], last)], grid, inward)
         into = ZERO
         for d in range(dim):
-            place[row, d] = points[free[row] - 1, d] if free[row] > 0 else cells[p, d]
-            into += (path[frames - 1, p, d] - place[row, d]) * inward[d]
+            place[row, d] = points[free[row] - 1, d] if free[row] > 0 else path[0, p, d]
+            into += (path[frames, p, d] - place[row, d]) * inward[d]
         square = ZERO
         for d in range(dim):
-            along[row, d] = path[frames - 1, p, d] - place[row, d] - (ZERO if into < ZERO else into) * inward[d]
+            along[row, d] = path[frames, p, d] - place[row, d] - (ZERO if into < ZERO else into) * inward[d]
             square += along[row, d] * along[row, d]
         if square > longest and np.isfinite(square):
             longest = square
@@ -172,7 +179,7 @@ def slide(
     What is left of the way is gone straight, evenly over the frames left, until the surface bends into it: looked at in
     `finer` pieces.
     """
-    frames, dim = len(path), path.shape[2]
+    frames, dim = len(path) - 1, path.shape[2]
     points, values = np.empty((finer, dim), np.float32), np.empty(finer, np.float32)
     for row in range(len(rows)):
         p = rows[row]
@@ -188,29 +195,29 @@ def slide(
                 gone = min(np.float32(passed) / left, part)
                 for d in range(dim):
                     onward = place[row, d] + along[row, d] * gone
-                    path[frame, p, d] = confine(onward, bounds[0, d], bounds[1, d], bounds[2, d] > ZERO)
+                    path[frame + 1, p, d] = confine(onward, bounds[0, d], bounds[1, d], bounds[2, d] > ZERO)
 
 
 @jit
-def push_out(cells: Any, path: Any, obstacle: Any, grid: Any, bounds: Any, rows: Any) -> Any:
+def push_out(path: Any, obstacle: Any, grid: Any, bounds: Any, rows: Any) -> Any:
     """Lead particles straight out of the obstacle that they are in, or to where it is least deep."""
-    frames, dim = len(path), cells.shape[1]
+    frames, dim = len(path) - 1, path.shape[2]
     points, values = np.empty((_WAYS_OUT + 1, dim), np.float32), np.empty(_WAYS_OUT + 1, np.float32)
     inward = np.empty(dim, np.float32)
     for p in rows:
-        _point_inward(obstacle, cells[p], grid, inward)
+        _point_inward(obstacle, path[0, p], grid, inward)
         for k in range(_WAYS_OUT + 1):
             for d in range(dim):
-                points[k, d] = cells[p, d] - inward[d] * np.float32(PIECE * k)
+                points[k, d] = path[0, p, d] - inward[d] * np.float32(PIECE * k)
         depths(obstacle, points, grid, values)
         best, is_out = 0, values[0] <= SURFACE
         for k in range(1, _WAYS_OUT + 1):
             if not is_out and (values[k] <= SURFACE or values[k] < values[best]):
                 best, is_out = k, values[k] <= SURFACE
-        for frame in range(frames):
+        for frame in range(1, frames + 1):
             for d in range(dim):
-                part = np.float32(frame + 1) / np.float32(frames)
-                place = cells[p, d] + (points[best, d] - cells[p, d]) * part
+                part = np.float32(frame) / np.float32(frames)
+                place = path[0, p, d] + (points[best, d] - path[0, p, d]) * part
                 if not np.isnan(path[frame, p, d]):
                     path[frame, p, d] = confine(place, bounds[0, d], bounds[1, d], bounds[2, d] > ZERO)
 

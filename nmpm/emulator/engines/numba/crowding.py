@@ -12,65 +12,64 @@ import numpy as np
 
 from nmpm._support.jit import jit
 from nmpm._support.threads import map_ranges, split
-from nmpm.emulator.engines.numba.gather import gather
+from nmpm.emulator.engines.numba.gather import ANYBODY, depths, gather
 from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
 from nmpm.emulator.engines.numba.path import BLOCK, CHUNK, ROUNDING, confine, energy, fill_mass
 from nmpm.emulator.engines.numba.scatter import scatter
-from nmpm.emulator.engines.numba.solids import FreeVolume, SolidCache, depths
+from nmpm.emulator.engines.numba.solids import FreeVolume, SolidCache
 from nmpm.emulator.engines.numba.state import StartArrays
 from nmpm.emulator.engines.torch.contact import SURFACE
 from nmpm.emulator.engines.torch.crowding import MAX_SHIFT, SWEEPS
 
 _COUNTED = 2**16  # particles of a chunk that is counted: each has a grid of its own
-_LINEAR = (0, 0)
 _NONE = np.empty(0, np.float32)
 ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _FURTHEST, _SURFACE = np.float32(MAX_SHIFT), np.float32(SURFACE)
 
 
 def spread_crowds(
-    start: StartArrays, path: Array, parameters: KernelParameters, solids: SolidCache, budget: float | None,
-    threads: int,
-) -> None:  # fmt: skip
+    start: StartArrays, parameters: KernelParameters, solids: SolidCache, budget: float | None, threads: int
+) -> None:
     """Change the path of a scene so that its overfull cells spread, within the energy `budget` if there is one."""
-    flow = _find_flow(start, path, parameters, solids.free, threads)
+    path, flow = start.path, _find_flow(start, parameters, solids.free, threads)
     if flow is None:
         return
     obstacle, spread = solids.obstacle if parameters.solids else _NONE, np.empty_like(path)
+    spread[0] = path[0]
     move = partial(drift, flow, path, start.mask, obstacle, parameters.grid, parameters.bounds, spread)
-    map_ranges(move, split(len(start.cells), CHUNK), threads)
-    share = 1.0 if budget is None else _affordable_share(start, path, spread, parameters, budget, threads)
-    path, spread = path[:, : len(start.cells)], spread[:, : len(start.cells)]
+    map_ranges(move, split(len(start.mask), CHUNK), threads)
+    share = 1.0 if budget is None else _affordable_share(start, spread, parameters, budget, threads)
+    path, spread = path[1:, : len(start.mask)], spread[1:, : len(start.mask)]
     path[:] = spread if share == 1 else path + np.float32(share) * (spread - path)
 
 
-def _find_flow(
-    start: StartArrays, path: Array, parameters: KernelParameters, free: FreeVolume | None, threads: int
-) -> Array | None:
+def _find_flow(start: StartArrays, parameters: KernelParameters, free: FreeVolume | None, threads: int) -> Array | None:
     """(size, D) displacements at the nodes; None where no cell is overfull."""
-    if free is None or not len(start.cells):
+    if free is None or not len(start.mask):
         return None
-    count = partial(count_particles, path[-1], start.mask, parameters.grid)
-    parts = map_ranges(count, split(len(start.cells), max(_COUNTED, 4 * parameters.size)), threads)
+    count = partial(count_particles, start.path[-1], start.mask, start.volume, parameters.grid)
+    parts = map_ranges(count, split(len(start.mask), max(_COUNTED, 4 * parameters.size)), threads)
     counts = parts[0]
     for part in parts[1:]:
         counts += part
     flow = np.empty((parameters.size, len(parameters.shape)), np.float32)
     particle = np.float32(parameters.particle_volume / parameters.density_cap)
-    full = push(counts.reshape(-1), particle, free.room, free.faces, free.inverse, parameters.shape, flow)
+    full = push(
+        np.ascontiguousarray(counts[:, 0]), particle, free.room, free.faces, free.inverse, parameters.shape, flow
+    )
     return flow if full else None
 
 
 def _affordable_share(
-    start: StartArrays, path: Array, spread: Array, parameters: KernelParameters, budget: float, threads: int
+    start: StartArrays, spread: Array, parameters: KernelParameters, budget: float, threads: int
 ) -> float:
     """The part of the way to the spread path that no frame's energy forbids, see the torch engine's `energy`."""
-    mass = np.empty(len(start.cells), np.float32)
-    fill_mass(start.material, start.mask, parameters.mass, mass)
+    path, mass = start.path, np.empty(len(start.mask), np.float32)
+    fill_mass(start.material, start.mask, start.volume, parameters.mass, mass)
 
     def energies(of: Array) -> Array:
-        find = partial(spread_energies, start.cells, path, of, start.gravity, mass, parameters.ratio)
-        return np.asarray(np.sum(map_ranges(find, split(len(start.cells), CHUNK), threads), axis=0))
+        find = partial(spread_energies, path, of, start.gravity, mass, parameters.ratio)
+        return np.asarray(np.sum(map_ranges(find, split(len(start.mask), CHUNK), threads), axis=0))
 
     after = energies(spread)
     exceeds = after > budget + ROUNDING * abs(budget)
@@ -82,14 +81,16 @@ def _affordable_share(
 
 
 @jit
-def count_particles(cells: Any, mask: Any, grid: Any, low: Any, high: Any) -> Any:
-    """(size, 1) particles `low` to `high` on each node, linearly."""
+def count_particles(cells: Any, mask: Any, volume: Any, grid: Any, low: Any, high: Any) -> Any:
+    """(size, 1) or (size, 2), whose first column has the particles `low` to `high` on each node, by volume."""
     size = 1
     for extent in grid[0]:
         size *= extent
-    counts = np.zeros((size, 1), np.float32)
-    nothing, only = np.empty((high - low, 0), np.float32), np.empty(0, np.int64)
-    scatter(nothing, only, mask[low:high], cells[low:high], grid[0], grid[1], _LINEAR, counts)
+    width = 1 if len(volume) else 0
+    counts, values = np.zeros((size, width + 1), np.float32), np.empty((high - low, width), np.float32)
+    if width:
+        values[:, 0] = volume[low:high]
+    scatter(values, ANYBODY, mask[low:high], cells[low:high], grid, counts)
     return counts
 
 
@@ -178,19 +179,19 @@ def drift(
 
     Padding stays, and nobody is spread into the obstacle.
     """
-    frames, dim = path.shape[0], path.shape[2]
-    shift, only = np.empty((BLOCK, dim), np.float32), np.empty(0, np.int64)
+    frames, dim = path.shape[0] - 1, path.shape[2]
+    shift = np.empty((BLOCK, dim), np.float32)
     places, values = np.empty((frames, dim), np.float32), np.empty(frames, np.float32)
     for begin in range(low, high, BLOCK):
         end = min(begin + BLOCK, high)
-        gather(flow, only, path[frames - 1, begin:end], grid[0], grid[1], _LINEAR, shift)
+        gather(flow, ANYBODY, path[frames, begin:end], grid, grid[0], shift)
         for p in range(end - begin):
             for d in range(dim):
                 way = shift[p, d] if mask[begin + p] else ZERO
                 way = _FURTHEST if way > _FURTHEST else way
                 shift[p, d] = -_FURTHEST if way < -_FURTHEST else way
-        for frame in range(frames):
-            part = np.float32(frame + 1) / np.float32(frames)
+        for frame in range(1, frames + 1):
+            part = np.float32(frame) / np.float32(frames)
             here, moved = path[frame, begin:end], spread[frame, begin:end]
             for d in range(dim):
                 lowest, highest, reflects = bounds[0, d], bounds[1, d], bounds[2, d] > ZERO
@@ -211,26 +212,22 @@ def _take_back(
             moves |= shift[p - begin, d] != ZERO
         if not moves:
             continue
-        places[:] = spread[:, p]
+        places[:] = spread[1:, p]
         depths(obstacle, places, grid, values)
         if (values > _SURFACE).any():
-            spread[:, p] = path[:, p]
+            spread[1:, p] = path[1:, p]
 
 
 @jit
-def spread_energies(
-    cells: Any, path: Any, spread: Any, gravity: Any, mass: Any, ratio: Any, low: Any, high: Any
-) -> Any:
+def spread_energies(path: Any, spread: Any, gravity: Any, mass: Any, ratio: Any, low: Any, high: Any) -> Any:
     """Energies (m + 1,) of the frames of a spread path, and of its end with the velocity of the path's end."""
-    frames = len(path)
+    frames = len(path) - 1
     energies = np.zeros(frames + 1)
     for begin in range(low, high, BLOCK):
         end = min(begin + BLOCK, high)
         for frame in range(frames):
-            here, before = spread[frame, begin:end], spread[frame - 1, begin:end] if frame > 0 else cells[begin:end]
+            here, before = spread[frame + 1, begin:end], spread[frame, begin:end]
             energies[frame] += energy(here, here, before, gravity, mass[begin:end], ratio)
-        last = path[frames - 2, begin:end] if frames > 1 else cells[begin:end]
-        energies[frames] += energy(
-            spread[frames - 1, begin:end], path[frames - 1, begin:end], last, gravity, mass[begin:end], ratio
-        )
+        last, end_of_path = path[frames - 1, begin:end], path[frames, begin:end]
+        energies[frames] += energy(spread[frames, begin:end], end_of_path, last, gravity, mass[begin:end], ratio)
     return energies

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -43,12 +44,13 @@ class KernelParameters:
         shape, wraps: Cells along each axis, and whether it is periodic.
         box: (2, D) the grid's lower corner and the cells' widths, in domain length.
         bounds, ratio: As in `nmpm.emulator.engines.numba`.
-        grid, p2g_grid, g2p_grid: Shape and periodic axes, with as many steps as the kernel has nodes along an axis.
+        grid, p2g_grid, g2p_grid: Shape, periodic axes, and a tuple as long as a linear transfer, or the model's, has
+            nodes along an axis.
         size: Number of cells.
         particle_volume: In cells.
         mass: (M,) of a particle of each material.
         channels: Number of channels of the grid state.
-        volume_channels: Its first one that is a volume fraction, and the one after the last.
+        first_field: Its first one that is a field of particles.
         solid: Whether it has a solid channel.
         constants: Whether gravity is among them.
         decoder: Shares of the particle's own and of the grid's velocity in the one at the start, and of gravity; 1 if
@@ -72,7 +74,7 @@ class KernelParameters:
     particle_volume: float
     mass: Array
     channels: int
-    volume_channels: tuple[int, int]
+    first_field: int
     solid: bool
     constants: bool
     decoder: tuple[np.float32, ...]
@@ -81,6 +83,15 @@ class KernelParameters:
     solids: bool
     floors: Array
     density_cap: float
+
+    @property
+    def materials(self) -> int:
+        return len(self.mass)
+
+    @property
+    def volume_channels(self) -> tuple[int, int]:
+        """The first channel of the grid state that is a volume fraction, and the one after the last."""
+        return self.materials * len(self.shape), self.materials * (len(self.shape) + 1)
 
 
 def kernel_parameters(recipe: EmulatorRecipe) -> KernelParameters:
@@ -92,21 +103,20 @@ def kernel_parameters(recipe: EmulatorRecipe) -> KernelParameters:
     low, high = np.where(scene.confined, low, -np.inf), np.where(scene.confined, high, np.inf)
     ratio = spacing / spacing[0]
     is_square = np.all(np.abs(ratio - 1) < 1e-6)
-    volumes = len(scene.materials) * scene.dim, len(scene.materials) * (scene.dim + 1)
     return KernelParameters(
         shape=grid.shape,
         wraps=grid.periodic,
         box=np.array((grid.lower, grid.spacing), np.float32),
         bounds=np.array((low, high, np.full(scene.dim, constraints.bounds == "reflect")), np.float32),
         ratio=np.where(is_square, 1.0, ratio).astype(np.float32),
-        grid=(grid.shape, grid.periodic),
+        grid=(grid.shape, grid.periodic, (0, 0)),
         p2g_grid=(grid.shape, grid.periodic, (0,) * _P2G_NODES[transfer]),
         g2p_grid=(grid.shape, grid.periodic, (0,) * _G2P_NODES[transfer]),
         size=grid.size,
         particle_volume=scene.particle_volume / grid.cell_volume,
         mass=np.array(scene.densities or (1.0,) * len(scene.materials), np.float32),
-        channels=volumes[1] + scene.walled + scene.dim * scene.gravity_varies,
-        volume_channels=volumes,
+        channels=len(scene.input_channels),
+        first_field=len(dataclasses.replace(scene, evolving=(), properties=(), parameters=()).input_channels),
         solid=scene.walled,
         constants=scene.gravity_varies,
         decoder=tuple(map(np.float32, _DECODERS[decoder](recipe.decoder))),

@@ -32,34 +32,34 @@ ZERO, HALF = np.float32(0), np.float32(0.5)
 
 
 def find_path(
-    start: StartArrays, fields: Array, parameters: KernelParameters, budget: float | None, path: Array, threads: int
+    start: StartArrays, fields: Array, parameters: KernelParameters, budget: float | None, threads: int
 ) -> None:
     """Fill in the path of a scene within the bounds, and within the energy `budget` if there is one."""
-    grid, decoder, bounds, ratio = parameters.g2p_grid, parameters.decoder, parameters.bounds, parameters.ratio
-    ranges = split(len(start.cells), CHUNK)
-    mass = np.empty(0 if budget is None else len(start.cells), np.float32)
+    path, (grid, bounds, ratio) = start.path, (parameters.g2p_grid, parameters.bounds, parameters.ratio)
+    ranges, decoder = split(len(start.mask), CHUNK), parameters.decoder
+    mass = np.empty(0 if budget is None else len(start.mask), np.float32)
     if budget is not None:
-        fill_mass(start.material, start.mask, parameters.mass, mass)
-    carried = np.empty_like(start.cells)
+        fill_mass(start.material, start.mask, start.volume, parameters.mass, mass)
+    carried = np.empty_like(start.velocity)
     move = partial(
-        free_path, start.cells, start.velocity, start.material, start.gravity, mass, grid, start.state, fields,
-        decoder, bounds, ratio, carried, path,
+        free_path, path, start.velocity, start.material, start.gravity, mass, grid, start.state, fields, decoder,
+        bounds, ratio, carried,
     )  # fmt: skip
     energies = map_ranges(move, ranges, threads)
     if budget is None or not energies:
         return
     limit = budget + ROUNDING * abs(budget)
     exceeds = (frame for frame, energy in enumerate(sum(energies[1:], energies[0]).tolist()) if energy > limit)
-    for frame in range(next(exceeds, len(path)), len(path)):
+    for frame in range(next(exceeds, len(fields)), len(fields)):
         propose = partial(
-            propose_frame, start.cells, start.velocity, start.material, start.gravity, mass, grid, fields,
-            decoder, bounds, ratio, carried, path, frame,
+            propose_frame, path, start.velocity, start.material, start.gravity, mass, grid, fields, decoder, bounds,
+            ratio, carried, frame,
         )  # fmt: skip
         factor, only_gainers = _affordable(sum(map_ranges(propose, ranges, threads)).tolist(), budget)
         if factor < 1:
             shorten = partial(
-                shorten_frame, start.cells, start.velocity, start.gravity, bounds, ratio, path, frame,
-                np.float32(factor), only_gainers,
+                shorten_frame, path, start.velocity, start.gravity, bounds, ratio, frame, np.float32(factor),
+                only_gainers,
             )  # fmt: skip
             map_ranges(shorten, ranges, threads)
 
@@ -88,11 +88,13 @@ def _largest_root(square: float, slope: float, constant: float) -> tuple[float, 
 
 
 @jit
-def fill_mass(material: Any, mask: Any, particle_mass: Any, mass: Any) -> Any:
+def fill_mass(material: Any, mask: Any, volume: Any, particle_mass: Any, mass: Any) -> Any:
     """Fill in each particle's share of the scene's mass, from the mass (M,) of a particle of each material."""
     total = 0.0
     for p in range(len(mask)):
         each = particle_mass[material[p]] if len(particle_mass) > 1 else np.float32(1)
+        if len(volume):
+            each *= volume[p]
         mass[p] = each if mask[p] else ZERO
         total += mass[p]
     scale = np.float32(1 / total) if total > 0 else ZERO
@@ -102,29 +104,28 @@ def fill_mass(material: Any, mask: Any, particle_mass: Any, mass: Any) -> Any:
 
 @jit
 def free_path(
-    cells: Any, velocity: Any, material: Any, gravity: Any, mass: Any, grid: Any, state: Any, fields: Any, decoder: Any,
-    bounds: Any, ratio: Any, carried: Any, path: Any, low: Any, high: Any,
+    path: Any, velocity: Any, material: Any, gravity: Any, mass: Any, grid: Any, state: Any, fields: Any, decoder: Any,
+    bounds: Any, ratio: Any, carried: Any, low: Any, high: Any,
 ) -> Any:  # fmt: skip
     """Fill in the path, and the velocities `carried` (N, D) that the decoder lets particles keep.
 
     Returns:
         (m,) energies of the frames; zeros where `mass` is empty.
     """
-    frames, dim = len(fields), cells.shape[1]
+    frames, dim = len(fields), path.shape[2]
     energies = np.zeros(frames)
     scratch, kept = np.empty((BLOCK, dim), np.float32), np.empty((BLOCK, dim), np.float32)
     for begin in range(low, high, BLOCK):
         end = min(begin + BLOCK, high)
-        start, kinds = cells[begin:end], material[begin:end]
+        start, kinds = path[0, begin:end], material[begin:end]
         _fill_carried(start, velocity[begin:end], kinds, grid, state, decoder, scratch, carried[begin:end])
         for frame in range(frames):
-            here = path[frame - 1, begin:end] if frame > 0 else start
             _move_block(
-                cells, material, gravity, grid, fields, decoder, bounds, carried, path, frame, begin, end, scratch, kept
+                path, material, gravity, grid, fields, decoder, bounds, carried, frame, begin, end, scratch, kept
             )
             if len(mass):
-                arrived = path[frame, begin:end]
-                energies[frame] += energy(arrived, arrived, here, gravity, mass[begin:end], ratio)
+                arrived = path[frame + 1, begin:end]
+                energies[frame] += energy(arrived, arrived, path[frame, begin:end], gravity, mass[begin:end], ratio)
     return energies
 
 
@@ -133,7 +134,7 @@ def _fill_carried(
     cells: Any, velocity: Any, material: Any, grid: Any, state: Any, decoder: Any, gathered: Any, carried: Any
 ) -> Any:
     if decoder[1] != ZERO:
-        gather(state, material, cells, grid[0], grid[1], grid[2], gathered)
+        gather(state, material, cells, grid, grid[0], gathered)
     for p in range(len(cells)):
         for d in range(cells.shape[1]):
             kept = ZERO  # not a sum over zero shares, which would make NaN of infinite velocities
@@ -146,25 +147,17 @@ def _fill_carried(
 
 @jit
 def _move_block(
-    cells: Any, material: Any, gravity: Any, grid: Any, fields: Any, decoder: Any, bounds: Any, carried: Any, path: Any,
+    path: Any, material: Any, gravity: Any, grid: Any, fields: Any, decoder: Any, bounds: Any, carried: Any,
     frame: Any, begin: Any, end: Any, gathered: Any, kept: Any,
 ) -> Any:  # fmt: skip
-    """Fill in a frame of the path of a block, from the one before; `gathered` and `kept` (BLOCK, D) are scratch."""
-    here = path[frame - 1, begin:end] if frame > 0 else cells[begin:end]
-    base = carried[begin:end]
+    """Fill in the path of a block after a frame, from before it; `gathered` and `kept` (BLOCK, D) are scratch."""
+    here, base = path[frame, begin:end], carried[begin:end]
     if frame > 0 and decoder[3] > ZERO:
-        _subtract(here, path[frame - 2, begin:end] if frame > 1 else cells[begin:end], kept)
         base = kept[: end - begin]
+        np.subtract(here, path[frame - 1, begin:end], base)
     falls = np.float32(1) if decoder[3] > ZERO else np.float32(frame + 1)
-    gather(fields[frame], material[begin:end], here, grid[0], grid[1], grid[2], gathered)
-    _move(here, base, gathered, gravity, decoder[2] * falls, bounds, path[frame, begin:end])
-
-
-@jit
-def _subtract(these: Any, those: Any, out: Any) -> Any:
-    for p in range(len(these)):
-        for d in range(these.shape[1]):
-            out[p, d] = these[p, d] - those[p, d]
+    gather(fields[frame], material[begin:end], here, grid, grid[0], gathered)
+    _move(here, base, gathered, gravity, decoder[2] * falls, bounds, path[frame + 1, begin:end])
 
 
 @jit
@@ -186,6 +179,14 @@ def confine(x: Any, lowest: Any, highest: Any, reflects: Any) -> Any:
     return lowest if x < lowest else x
 
 
+@jit
+def confine_all(cells: Any, bounds: Any) -> Any:
+    """Confine positions (N, D) in place."""
+    for d in range(cells.shape[1]):
+        for p in range(len(cells)):
+            cells[p, d] = confine(cells[p, d], bounds[0, d], bounds[1, d], bounds[2, d] > ZERO)
+
+
 @jit_sum
 def energy(cells: Any, arrived: Any, before: Any, gravity: Any, mass: Any, ratio: Any) -> Any:
     """Energy of particles at `cells` (n, D) with the steps from `before` to `arrived`, weighted by their mass."""
@@ -200,25 +201,23 @@ def energy(cells: Any, arrived: Any, before: Any, gravity: Any, mass: Any, ratio
 
 @jit
 def propose_frame(
-    cells: Any, velocity: Any, material: Any, gravity: Any, mass: Any, grid: Any, fields: Any, decoder: Any,
-    bounds: Any, ratio: Any, carried: Any, path: Any, frame: Any, low: Any, high: Any,
+    path: Any, velocity: Any, material: Any, gravity: Any, mass: Any, grid: Any, fields: Any, decoder: Any, bounds: Any,
+    ratio: Any, carried: Any, frame: Any, low: Any, high: Any,
 ) -> Any:  # fmt: skip
-    """Fill in a frame of the path as if it were free.
+    """Fill in the path after a frame as if it were free.
 
     Returns:
         (5,): the energy that the scene would have if nobody moved; kinetic energy of the particles that gain energy in
         this frame, and of all; what falling takes from the potential energy of those, and of all.
     """
     sums = np.zeros(5)
-    dim = cells.shape[1]
+    dim = path.shape[2]
     scratch, kept = np.empty((BLOCK, dim), np.float32), np.empty((BLOCK, dim), np.float32)
     for begin in range(low, high, BLOCK):
         end = min(begin + BLOCK, high)
-        _move_block(
-            cells, material, gravity, grid, fields, decoder, bounds, carried, path, frame, begin, end, scratch, kept
-        )
+        _move_block(path, material, gravity, grid, fields, decoder, bounds, carried, frame, begin, end, scratch, kept)
         for p in range(begin, end):
-            kinetic, fall, height, gains = _balance(cells, velocity, gravity, ratio, path, frame, p)
+            kinetic, fall, height, gains = _balance(path, velocity, gravity, ratio, frame, p)
             sums[0] -= mass[p] * height
             sums[2] += mass[p] * kinetic
             sums[4] -= mass[p] * fall
@@ -229,16 +228,13 @@ def propose_frame(
 
 
 @jit
-def _balance(cells: Any, velocity: Any, gravity: Any, ratio: Any, path: Any, frame: Any, p: Any) -> Any:
+def _balance(path: Any, velocity: Any, gravity: Any, ratio: Any, frame: Any, p: Any) -> Any:
     """Of a step: its kinetic energy, the work of gravity, minus the potential before, and whether energy is gained."""
     kinetic, fall, height, gain = ZERO, ZERO, ZERO, ZERO
-    for d in range(cells.shape[1]):
-        here = path[frame - 1, p, d] if frame > 0 else cells[p, d]
-        step = (path[frame, p, d] - here) * ratio[d]
-        if frame == 0:
-            before = velocity[p, d] * ratio[d]
-        else:
-            before = (here - (path[frame - 2, p, d] if frame > 1 else cells[p, d])) * ratio[d]
+    for d in range(path.shape[2]):
+        here = path[frame, p, d]
+        step = (path[frame + 1, p, d] - here) * ratio[d]
+        before = (velocity[p, d] if frame == 0 else here - path[frame - 1, p, d]) * ratio[d]
         place, pull = here * ratio[d], gravity[d] * ratio[d]
         kinetic += HALF * step * step
         fall += step * pull
@@ -249,14 +245,27 @@ def _balance(cells: Any, velocity: Any, gravity: Any, ratio: Any, path: Any, fra
 
 @jit
 def shorten_frame(
-    cells: Any, velocity: Any, gravity: Any, bounds: Any, ratio: Any, path: Any, frame: Any, factor: Any,
-    only_gainers: Any, low: Any, high: Any,
+    path: Any, velocity: Any, gravity: Any, bounds: Any, ratio: Any, frame: Any, factor: Any, only_gainers: Any,
+    low: Any, high: Any,
 ) -> Any:  # fmt: skip
     """Multiply the proposed steps of a frame by a factor, of the particles that gain energy or of all."""
     for p in range(low, high):
-        if only_gainers and not _balance(cells, velocity, gravity, ratio, path, frame, p)[3]:
+        if only_gainers and not _balance(path, velocity, gravity, ratio, frame, p)[3]:
             continue
-        for d in range(cells.shape[1]):
-            here = path[frame - 1, p, d] if frame > 0 else cells[p, d]
-            arrived = here + factor * (path[frame, p, d] - here)
-            path[frame, p, d] = confine(arrived, bounds[0, d], bounds[1, d], bounds[2, d] > ZERO)
+        for d in range(path.shape[2]):
+            here = path[frame, p, d]
+            arrived = here + factor * (path[frame + 1, p, d] - here)
+            path[frame + 1, p, d] = confine(arrived, bounds[0, d], bounds[1, d], bounds[2, d] > ZERO)
+
+
+@jit
+def fill_gains(path: Any, material: Any, grid: Any, rates: Any, gains: Any, values: Any, low: Any, high: Any) -> Any:
+    """Fill in `gains` (m, N, E), the sums of the rates (m, size, M E) that particles meet before each frame's step.
+
+    `values` is a tuple of length E.
+    """
+    for frame in range(len(rates)):
+        here = gains[frame, low:high]
+        gather(rates[frame], material[low:high], path[frame, low:high], grid, values, here)
+        if frame > 0:
+            here += gains[frame - 1, low:high]

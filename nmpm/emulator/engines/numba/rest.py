@@ -10,9 +10,10 @@ import numpy as np
 from nmpm._support.jit import jit
 from nmpm._support.threads import map_ranges, split
 from nmpm.emulator.constraints import FREE_FALL_SHARE
+from nmpm.emulator.engines.numba.gather import depths
 from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
 from nmpm.emulator.engines.numba.path import CHUNK, confine
-from nmpm.emulator.engines.numba.solids import cell_index, depths, stride_of, widen
+from nmpm.emulator.engines.numba.solids import cell_index, stride_of, widen
 from nmpm.emulator.engines.numba.state import StartArrays
 from nmpm.emulator.engines.torch.contact import SURFACE
 from nmpm.emulator.engines.torch.support import ENOUGH, MAX_DROP, REACH
@@ -22,17 +23,17 @@ _ENOUGH, _SURFACE, _MAX_DROP = np.float32(ENOUGH), np.float32(SURFACE), np.float
 _FREE_FALL = np.float32(FREE_FALL_SHARE)
 
 
-def bring_to_rest(start: StartArrays, parameters: KernelParameters, obstacle: Array, path: Array, threads: int) -> None:
+def bring_to_rest(start: StartArrays, parameters: KernelParameters, obstacle: Array, threads: int) -> None:
     """Change the path of a scene: resting particles stay where they started if something holds them up, or fall."""
     held = np.empty(parameters.size, np.bool_)
     find_support(
         start.state, parameters.volume_channels, obstacle, start.gravity, parameters.grid, parameters.floors, held
     )
     stop = partial(
-        stop_resting, start.cells, path, start.gravity, np.float32(parameters.rest_speed), obstacle, parameters.grid,
+        stop_resting, start.path, start.gravity, np.float32(parameters.rest_speed), obstacle, parameters.grid,
         held, parameters.bounds,
     )  # fmt: skip
-    map_ranges(stop, split(len(start.cells), CHUNK), threads)
+    map_ranges(stop, split(len(start.mask), CHUNK), threads)
 
 
 @jit
@@ -41,7 +42,7 @@ def find_support(state: Any, channels: Any, obstacle: Any, gravity: Any, grid: A
 
     `channels` are the state's volume fractions, from and to; `floors` (D, 2) of `support.floor_rows`.
     """
-    shape, wraps = grid
+    shape, wraps, _ = grid
     axis, largest = 0, ZERO
     for d in range(len(shape)):
         if abs(gravity[d]) > largest:
@@ -83,18 +84,17 @@ def _sweep(bears: Any, obstacle: Any, shape: Any, axis: Any, upwards: Any, floor
 
 @jit
 def stop_resting(
-    cells: Any, path: Any, gravity: Any, speed: Any, obstacle: Any, grid: Any, held: Any, bounds: Any, low: Any,
-    high: Any,
-) -> Any:  # fmt: skip
+    path: Any, gravity: Any, speed: Any, obstacle: Any, grid: Any, held: Any, bounds: Any, low: Any, high: Any
+) -> Any:
     """Leave particles where they started that neither move nor fall, as `nmpm.emulator.constraints.at_rest` says.
 
     Those outside of `held` (size,) cells fall instead. `speed` is the rest speed in cells per frame.
     """
-    frames, dim = len(path), cells.shape[1]
+    frames, dim, cells = len(path) - 1, path.shape[2], path[0]
     drops, still = np.empty((frames, dim), np.float32), np.empty(high - low, np.bool_)
     _fill_drops(gravity, drops)
-    middle = path[max(frames // 2, 1) - 1, low:high]
-    _find_still(cells[low:high], middle, path[frames - 1, low:high], frames, gravity, speed, still)
+    middle = path[max(frames // 2, 1), low:high]
+    _find_still(cells[low:high], middle, path[frames, low:high], frames, gravity, speed, still)
     end, depth = np.empty((1, dim), np.float32), np.empty(1, np.float32)
     for p in range(low, high):
         if not still[p - low]:
@@ -110,7 +110,7 @@ def stop_resting(
                 x = cells[p, d]
                 if falls:
                     x = confine(x + drops[frame, d], bounds[0, d], bounds[1, d], bounds[2, d] > ZERO)
-                path[frame, p, d] = x
+                path[frame + 1, p, d] = x
 
 
 @jit

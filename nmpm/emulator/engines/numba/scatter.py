@@ -7,78 +7,52 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.jit import jit
-from nmpm.emulator.engines.numba.nodes import ONE, ZERO, linear_nodes, stencil, weight_slope
+from nmpm.emulator.engines.numba.nodes import ONE, ZERO, linear_nodes, scatter_nodes, stencil, weight_slope
 
 
 @jit
-def scatter(values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, steps: Any, out: Any) -> Any:
+def scatter(values: Any, material: Any, mask: Any, cells: Any, grid: Any, out: Any) -> Any:
     """Add to `out` (size, M V + M) the values (N, V) of the particles of each material, then their numbers.
 
     V may be 0. Particles of an unknown material count nowhere.
     """
-    if len(steps) != 2:
-        _scatter_stencil(values, material, mask, cells, shape, wraps, steps, out)
-    elif len(shape) == 2:
-        _scatter_linear_2d(values, material, mask, cells, shape, wraps, out)
+    if len(grid[2]) == 2:
+        _scatter_linear(values, material, mask, cells, grid, out)
     else:
-        _scatter_linear_3d(values, material, mask, cells, shape, wraps, out)
+        _scatter_stencil(values, material, mask, cells, grid, out)
 
 
 @jit
-def _scatter_linear_2d(values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, out: Any) -> Any:
-    width = values.shape[1]
+def _scatter_linear(values: Any, material: Any, mask: Any, cells: Any, grid: Any, out: Any) -> Any:
+    shape, wraps, _ = grid
+    width, last, layers = values.shape[1], len(shape) - 1, shape[len(shape) - 1]
     materials = out.shape[1] // (width + 1)
     for p in range(len(cells)):
         kind = material[p] if len(material) else 0
         if not mask[p] or kind < 0 or kind >= materials:
             continue
-        i0, i1, x = _linear_nodes(cells[p, 0], shape[0], wraps[0])
-        j0, j1, y = _linear_nodes(cells[p, 1], shape[1], wraps[1])
+        i0, i1, x = scatter_nodes(cells[p, 0], shape[0], wraps[0])
+        j0, j1, y = scatter_nodes(cells[p, 1], shape[1], wraps[1])
         a, b, c, d = i0 * shape[1] + j0, i0 * shape[1] + j1, i1 * shape[1] + j0, i1 * shape[1] + j1
         at_a, at_b, at_c, at_d = (ONE - x) * (ONE - y), (ONE - x) * y, x * (ONE - y), x * y
+        k0, k1, z = scatter_nodes(cells[p, last], layers, wraps[last]) if last == 2 else (j0, j1, y)
         for k in range(width + 1):
             value = values[p, k] if k < width else ONE
-            col = kind * width + k if k < width else materials * width + kind
-            out[a, col] += at_a * value
-            out[b, col] += at_b * value
-            out[c, col] += at_c * value
-            out[d, col] += at_d * value
+            column = kind * width + k if k < width else materials * width + kind
+            if last == 1:
+                out[a, column] += at_a * value
+                out[b, column] += at_b * value
+                out[c, column] += at_c * value
+                out[d, column] += at_d * value
+            else:
+                for node, weight in ((a, at_a), (b, at_b), (c, at_c), (d, at_d)):
+                    out[node * layers + k0, column] += weight * (ONE - z) * value
+                    out[node * layers + k1, column] += weight * z * value
 
 
 @jit
-def _scatter_linear_3d(values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, out: Any) -> Any:
-    width = values.shape[1]
-    materials = out.shape[1] // (width + 1)
-    for p in range(len(cells)):
-        kind = material[p] if len(material) else 0
-        if not mask[p] or kind < 0 or kind >= materials:
-            continue
-        i0, i1, x = _linear_nodes(cells[p, 0], shape[0], wraps[0])
-        j0, j1, y = _linear_nodes(cells[p, 1], shape[1], wraps[1])
-        k0, k1, z = _linear_nodes(cells[p, 2], shape[2], wraps[2])
-        for row, along_x in ((i0, ONE - x), (i1, x)):
-            for column, along_y in ((j0, ONE - y), (j1, y)):
-                node, weight = (row * shape[1] + column) * shape[2], along_x * along_y
-                for k in range(width + 1):
-                    value = values[p, k] if k < width else ONE
-                    col = kind * width + k if k < width else materials * width + kind
-                    out[node + k0, col] += weight * (ONE - z) * value
-                    out[node + k1, col] += weight * z * value
-
-
-@jit
-def _linear_nodes(x: Any, count: Any, wraps: Any) -> Any:
-    """As `linear_nodes`, but a NaN is passed on to the grid, on a wall axis at its first node."""
-    lower, upper, share = linear_nodes(x, count, wraps)
-    if not np.isnan(x):
-        return lower, upper, share
-    return (lower, upper, np.float32(np.nan)) if wraps else (np.int64(0), np.int64(0), np.float32(np.nan))
-
-
-@jit
-def _scatter_stencil(
-    values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, steps: Any, out: Any
-) -> Any:
+def _scatter_stencil(values: Any, material: Any, mask: Any, cells: Any, grid: Any, out: Any) -> Any:
+    shape, wraps, steps = grid
     width, last, depth = values.shape[1], len(shape) - 1, len(steps) if len(shape) == 3 else 1
     materials = out.shape[1] // (width + 1)
     for p in range(len(cells)):
@@ -101,14 +75,15 @@ def _scatter_stencil(
 
 @jit
 def scatter_adjoint(
-    values: Any, material: Any, mask: Any, cells: Any, shape: Any, wraps: Any, mean: Any, grad_out: Any,
-    grad_cells: Any, grad_values: Any,
+    values: Any, material: Any, mask: Any, cells: Any, grid: Any, mean: Any, grad_out: Any, grad_cells: Any,
+    grad_values: Any,
 ) -> Any:  # fmt: skip
     """Add the gradients of linear 2-D `scatter` with respect to positions and values.
 
     `mean` (size, M V + ...) begins with the means of each material's values: their sums over the numbers. `grad_out`
     (size, M V + M) has the gradients with respect to the sums, then to the numbers, each at fixed means.
     """
+    shape, wraps, _ = grid
     materials = grad_out.shape[1] // (values.shape[1] + 1)
     for p in range(len(cells)):
         kind = material[p] if len(material) else 0

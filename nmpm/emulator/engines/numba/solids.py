@@ -10,8 +10,6 @@ from torch import Tensor
 
 from nmpm._support.jit import jit
 from nmpm.emulator.engines.numba.arrays import as_array
-from nmpm.emulator.engines.numba.gather import bilinear
-from nmpm.emulator.engines.numba.nodes import linear_nodes
 from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
 from nmpm.emulator.engines.torch.contact import SURFACE, obstacle_share
 from nmpm.emulator.engines.torch.crowding import CLOSED
@@ -72,28 +70,9 @@ def _prepare_scene(parameters: KernelParameters, solid: Tensor, walls: Tensor) -
 
 
 @jit
-def depths(obstacle: Any, places: Any, grid: Any, out: Any) -> Any:
-    """Fill in the share of obstacle (K,) at places (K, D), interpolated linearly."""
-    shape, wraps = grid
-    for k in range(len(places)):
-        i0, i1, x = linear_nodes(places[k, 0], shape[0], wraps[0])
-        j0, j1, y = linear_nodes(places[k, 1], shape[1], wraps[1])
-        a, b, c, d = i0 * shape[1] + j0, i0 * shape[1] + j1, i1 * shape[1] + j0, i1 * shape[1] + j1
-        if len(shape) == 2:
-            out[k] = bilinear(obstacle[a], obstacle[b], obstacle[c], obstacle[d], x, y)
-        else:
-            last, n = len(shape) - 1, shape[len(shape) - 1]
-            k0, k1, z = linear_nodes(places[k, last], n, wraps[last])
-            a, b, c, d = a * n, b * n, c * n, d * n
-            low = bilinear(obstacle[a + k0], obstacle[b + k0], obstacle[c + k0], obstacle[d + k0], x, y)
-            high = bilinear(obstacle[a + k1], obstacle[b + k1], obstacle[c + k1], obstacle[d + k1], x, y)
-            out[k] = (ONE - z) * low + z * high
-
-
-@jit
 def cell_index(cells: Any, grid: Any, p: Any) -> Any:
     """The index of the cell that particle p is in; of the first along an axis where its position is not finite."""
-    shape, wraps = grid
+    shape, wraps, _ = grid
     node = np.int64(0)
     for d in range(len(shape)):
         row = np.int64(np.floor(cells[p, d])) if np.isfinite(cells[p, d]) else 0
@@ -131,7 +110,7 @@ def fill_clearance(obstacle: Any, grid: Any, clearance: Any) -> Any:
 
     Along each axis: a particle that moves no further than one cell less along any axis touches nothing.
     """
-    shape, wraps = grid
+    shape, wraps, _ = grid
     near = obstacle > np.float32(SURFACE)
     clearance[:] = np.float32(FAR)
     for distance in range(-1, FAR):  # a particle's depth is interpolated from the cells beside its own

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,33 +14,41 @@ from nmpm._support.jit import jit
 from nmpm._support.threads import map_ranges, split
 from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
 from nmpm.emulator.engines.numba.scatter import scatter
+from nmpm.emulator.engines.numba.solids import SolidCache
+from nmpm.transfer.transfer import LEAST_SHARE
 
 _CHUNK = 2**16  # particles; each chunk has a grid of its own, so that sums do not depend on the number of threads
 _BLOCK = 64  # nodes
-_NONE = np.empty(0, np.float32)
-ZERO, ONE = np.float32(0), np.float32(1)
+ONE = np.float32(1)
+_LEAST = np.float32(LEAST_SHARE)
 
 
 class StartArrays(NamedTuple):
-    """Particles and grid state at a bundle's start, see `numba`; of B scenes: with a first axis (B,)."""
+    """Particles and grid state at a bundle's start, see `numba`; of B scenes: with a first axis (B,).
 
-    cells: Array
+    `fields` are those of the particles; `ahead` has the solids of all scenes at each frame, where obstacles move.
+    """
+
+    path: Array
     velocity: Array
     gravity: Array
     material: Array
     mask: Array
+    volume: Array
     state: Array
+    fields: Mapping[str, Tensor] = MappingProxyType({})
+    ahead: Sequence[Sequence[SolidCache]] = ()
 
     def scene(self, index: int) -> StartArrays:
-        """One of the scenes."""
-        return StartArrays(*(values[index] for values in self))
+        """The arrays of one of the scenes."""
+        return StartArrays(*(values[index] for values in self[:7]))
 
     def real_scene(self, index: int) -> StartArrays:
-        """One of the scenes without the padding at its end."""
+        """One of the scenes without the padding at its end, but for the path."""
         scene = self.scene(index)
         n = count_real(scene.mask)
-        return StartArrays(
-            scene.cells[:n], scene.velocity[:n], scene.gravity, scene.material[:n], scene.mask[:n], scene.state
+        return scene._replace(
+            velocity=scene.velocity[:n], material=scene.material[:n], mask=scene.mask[:n], volume=scene.volume[:n]
         )
 
 
@@ -47,45 +57,73 @@ def count_real(mask: Array) -> int:
     return len(mask) - int(mask[::-1].argmax()) if len(mask) else 0
 
 
-def rasterise(
-    parameters: KernelParameters, position: Array, velocity: Array, gravity: Array, material: Array, mask: Array,
-    solid: Array,
-) -> StartArrays:  # fmt: skip
-    """Particles in grid units and the grid state, as `nmpm.emulator.rasterise.grid_state`; arrays as in `Particles`.
+class ParticleArrays(NamedTuple):
+    """What `rasterise` takes of B scenes, as in `Particles` but for empty last axes.
 
-    `material` is (B, 0) where there is only one; `solid` is (B, C_solid, *S).
+    Args:
+        position, velocity, gravity, mask: As there.
+        material: (B, 0) where there is only one.
+        volume: (B, 0) where all particles have the scene's.
+        values: (B, N, P) fields of the particles, and
+        constants: (B, G) of the scenes, as `FieldScales` gives them.
+        solid: (B, C, *S) channels of the solids.
     """
-    cells, moved = np.empty((2, *position.shape), np.float32)
-    pull, size = gravity / parameters.box[1], parameters.size
-    state = np.empty((len(position), size, parameters.channels), np.float32)
-    for b in range(len(position)):
-        sums = _sum_particles(parameters, position[b], velocity[b], material[b], mask[b], cells[b], moved[b])
+
+    position: Array
+    velocity: Array
+    gravity: Array
+    mask: Array
+    material: Array
+    volume: Array
+    values: Array
+    constants: Array
+    solid: Array
+
+
+def rasterise(parameters: KernelParameters, particles: ParticleArrays, frames: int) -> StartArrays:
+    """Particles in grid units and the grid state, as `nmpm.emulator.rasterise.grid_state`.
+
+    The paths have memory for so many frames after the first.
+    """
+    position = particles.position
+    batch, count, dim = position.shape
+    # Memory of NumPy's asks for huge pages, which that of a fresh tensor does not.
+    path, moved = np.empty((batch, frames + 1, count, dim), np.float32), np.empty(position.shape, np.float32)
+    pull = particles.gravity / parameters.box[1]
+    state = np.empty((batch, parameters.size, parameters.channels), np.float32)
+    for b in range(batch):
+        sums = _sum_particles(parameters, ParticleArrays(*(each[b] for each in particles)), path[b, 0], moved[b])
         fill_state(
-            sums, position.shape[2], np.float32(parameters.particle_volume),
-            solid[b, 0].reshape(-1) if parameters.solid else _NONE, pull[b] if parameters.constants else _NONE,
-            state[b],
+            sums, dim, particles.values.shape[2], np.float32(parameters.particle_volume),
+            particles.solid[b].reshape(-1, parameters.size), pull[b] if parameters.constants else pull[b, :0],
+            particles.constants[b], state[b],
         )  # fmt: skip
-    return StartArrays(cells, moved, pull, material, mask, state)
+    return StartArrays(path, moved, pull, particles.material, particles.mask, particles.volume, state)
 
 
-def _sum_particles(
-    parameters: KernelParameters, position: Array, velocity: Array, material: Array, mask: Array, cells: Array,
-    moved: Array,
-) -> Array:  # fmt: skip
-    """Fill in positions and velocities (N, D) of a scene in grid units, and return the sums of `scatter`."""
-    (shape, wraps, steps), columns = parameters.p2g_grid, parameters.volume_channels[1]
-    real = count_real(mask)
-    to_cells(position[real:], velocity[real:], parameters.box, cells[real:], moved[real:])
+def _sum_particles(parameters: KernelParameters, scene: ParticleArrays, cells: Array, moved: Array) -> Array:
+    """Fill in positions and velocities (N, D) of a scene in grid units, and return the sums of `scatter`.
+
+    Of velocities and fields; where particles have volumes, times those, which then are a further value.
+    """
+    materials, width = len(parameters.mass), cells.shape[1] + scene.values.shape[1] + bool(len(scene.volume))
+    real = count_real(scene.mask)
+    to_cells(scene.position[real:], scene.velocity[real:], parameters.box, cells[real:], moved[real:])
 
     def add(low: int, high: int) -> Array:
-        sums = np.zeros((parameters.size, columns), np.float32)
-        here, speeds = cells[low:high], moved[low:high]
-        to_cells(position[low:high], velocity[low:high], parameters.box, here, speeds)
-        scatter(speeds, material[low:high], mask[low:high], here, shape, wraps, steps, sums)
+        sums = np.zeros((parameters.size, materials * (width + 1)), np.float32)
+        here, values = cells[low:high], moved[low:high]
+        to_cells(scene.position[low:high], scene.velocity[low:high], parameters.box, here, values)
+        if scene.values.shape[1]:
+            values = np.concatenate((values, scene.values[low:high]), axis=1)
+        if len(scene.volume):
+            volume = scene.volume[low:high, None]
+            values = np.concatenate((values * volume, volume), axis=1)
+        scatter(values, scene.material[low:high], scene.mask[low:high], here, parameters.p2g_grid, sums)
         return sums
 
     parts = map_ranges(add, split(real, max(_CHUNK, 4 * parameters.size)), torch.get_num_threads())
-    total = parts[0] if parts else np.zeros((parameters.size, columns), np.float32)
+    total = parts[0] if parts else np.zeros((parameters.size, materials * (width + 1)), np.float32)
     for part in parts[1:]:
         total += part
     return total
@@ -102,26 +140,39 @@ def to_cells(position: Any, velocity: Any, box: Any, cells: Any, moved: Any) -> 
 
 
 @jit
-def fill_state(sums: Any, width: Any, particle_volume: Any, solid: Any, constants: Any, state: Any) -> Any:
-    """Fill in the channels of a grid state: mean values, shares of volume, the solid, the constants.
+def fill_state(
+    sums: Any, dim: Any, fields: Any, particle_volume: Any, solid: Any, gravity: Any, constants: Any, state: Any
+) -> Any:
+    """Fill in the channels of a grid state (size, C_in), in the order of `Scene.input_channels`.
 
-    From `sums` (size, M V + M) of V = `width` values of each material, then numbers of particles; `solid` (size,),
-    empty where there is no such channel; and `constants` (K,), which are the same everywhere.
+    Args:
+        sums: (size, M V + M) of the values of each material, then numbers of particles; V is `dim + fields`, or one
+            more: the volume, which then stands for the number.
+        particle_volume: In cells.
+        solid: (C, size) channels of the solids.
+        gravity, constants: (D,), (G,) the same everywhere; empty where there are no such channels.
+        state: Is filled.
     """
-    materials = sums.shape[1] // (width + 1)
+    materials = (state.shape[1] - len(solid) - len(gravity) - len(constants)) // (dim + 1 + fields)
+    width, first_solid = sums.shape[1] // materials - 1, materials * (dim + 1)
+    counts, apart = (materials * width, 1) if width == dim + fields else (width - 1, width)
+    first_gravity, first_constant = first_solid + len(solid), state.shape[1] - len(constants)
+    first_field = first_gravity + len(gravity)
     for node in range(len(sums)):
         for kind in range(materials):
-            count = sums[node, materials * width + kind]
-            total = count if count > ZERO else ONE
-            for k in range(kind * width, (kind + 1) * width):
-                state[node, k] = sums[node, k] / total
-            state[node, materials * width + kind] = count * particle_volume
-        channel = sums.shape[1]
-        if len(solid):
-            state[node, channel] = solid[node]
-            channel += 1
-        for k in range(len(constants)):
-            state[node, channel + k] = constants[k]
+            count = sums[node, counts + apart * kind]
+            total = count if count > _LEAST else ONE
+            for k in range(dim):
+                state[node, kind * dim + k] = sums[node, kind * width + k] / total
+            state[node, materials * dim + kind] = count * particle_volume
+            for k in range(fields):
+                state[node, first_field + kind * fields + k] = sums[node, kind * width + dim + k] / total
+    for k in range(len(solid)):
+        state[:, first_solid + k] = solid[k]
+    for k in range(len(gravity)):
+        state[:, first_gravity + k] = gravity[k]
+    for k in range(len(constants)):
+        state[:, first_constant + k] = constants[k]
 
 
 @jit
@@ -143,13 +194,12 @@ def output_array(output: Tensor) -> Any:
 
 @jit
 def unpack(output: Any, scale: Any, fields: Any) -> Any:
-    """Fill in the fields, whose channels lie next to each other, from an output (m, C, size) and its scale (m C,)."""
-    channels = fields.shape[2]
+    """Fill in the fields, whose channels lie next to each other, from an output (m, C, size) and its scale (m, C)."""
     for begin in range(0, fields.shape[1], _BLOCK):
         end = min(begin + _BLOCK, fields.shape[1])
         for frame in range(len(fields)):
-            for c in range(channels):
+            for c in range(fields.shape[2]):
                 these, field = output[frame, c, begin:end], fields[frame, begin:end]
-                factor = scale[frame * channels + c]
+                factor = scale[frame, c]
                 for node in range(len(these)):
                     field[node, c] = these[node] * factor

@@ -20,14 +20,16 @@ from nmpm._support.jit import jit
 from nmpm._support.threads import for_each
 from nmpm.emulator.bundle import RolloutContext
 from nmpm.emulator.engines.numba.arrays import as_array, as_copy, as_grid, check_materials, material_rows
-from nmpm.emulator.engines.numba.gather import gather_adjoint
+from nmpm.emulator.engines.numba.gather import gather, gather_adjoint
 from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
 from nmpm.emulator.engines.numba.path import find_path
 from nmpm.emulator.engines.numba.scatter import scatter_adjoint
-from nmpm.emulator.engines.numba.state import StartArrays, output_array, rasterise, unpack
+from nmpm.emulator.engines.numba.state import ParticleArrays, StartArrays, output_array, rasterise, unpack
 from nmpm.emulator.engines.torch.engine import TorchEngine
 from nmpm.emulator.engines.torch.start import BundleStart
+from nmpm.emulator.rasterise import solid_velocity
 from nmpm.particles import Particles, scene_volumes
+from nmpm.transfer.transfer import LEAST_SHARE
 
 ZERO, ONE = np.float32(0), np.float32(1)
 
@@ -40,8 +42,14 @@ class NumbaTraining(TorchEngine):
     name = "numba training"
 
     def grid_state(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        given = (particles.position, particles.velocity, particles.gravity, particles.material, particles.mask)
-        cells, velocity, gravity, state = Rasterise.apply(self.parameters, *given, solid)  # type: ignore[no-untyped-call]
+        model, scales = self.emulator, self.emulator.field_scales
+        if model.scene.moving_obstacles:
+            moved = solid_velocity(model.grid, model.transfer, particles, torch.float32)
+            solid = torch.cat([solid, moved], dim=1)
+        cells, velocity, gravity, state = Rasterise.apply(  # type: ignore[no-untyped-call]
+            self.parameters, particles.position, particles.velocity, scales.of_particles(particles), particles.gravity,
+            particles.material, particles.mask, scales.of_scene(particles), solid,
+        )  # fmt: skip
         if (volume := particles.volume) is not None and (of_scene := scene_volumes(volume, particles.mask)) is not None:
             factor, (first, end) = state.new_ones(state.shape[:2]), self.parameters.volume_channels
             factor[:, first:end] = of_scene.unsqueeze(1)
@@ -51,53 +59,71 @@ class NumbaTraining(TorchEngine):
     def path(self, start: BundleStart, output: Tensor, context: RolloutContext) -> Tensor:  # noqa: ARG002 (no constraint acts)
         path: Tensor = FreePath.apply(  # type: ignore[no-untyped-call]  # (torch's stubs)
             self.parameters, start.cells, start.velocity, start.gravity, start.material, start.mask, start.state,
-            output, self.emulator.output_scale,
+            output, self.emulator.output_scale[:, : output.shape[2]],
         )  # fmt: skip
         return path
 
+    def gather(self, field: Tensor, cells: Tensor, material: Tensor) -> Tensor:
+        values: Tensor = Gather.apply(self.parameters, field, cells, material)  # type: ignore[no-untyped-call]
+        return values
+
 
 class Rasterise(torch.autograd.Function):
-    """Particles in grid units and the grid state, with gradients with respect to positions and velocities."""
+    """Particles in grid units and the grid state, with gradients with respect to positions, velocities and fields."""
 
     @staticmethod
     def forward(
-        ctx: Any, parameters: KernelParameters, position: Tensor, velocity: Tensor, gravity: Tensor, material: Tensor,
-        mask: Tensor, solid: Tensor,
+        ctx: Any, parameters: KernelParameters, position: Tensor, velocity: Tensor, values: Tensor, gravity: Tensor,
+        material: Tensor, mask: Tensor, constants: Tensor, solid: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # fmt: skip
         """(B, N, D) positions, (B, N, D) velocities and (B, 1, D) gravity in cells; (B, C_in, *S) grid state."""
-        kinds = material_rows(material, len(parameters.mass))
-        start = rasterise(
-            parameters, as_array(position), as_array(velocity), as_array(gravity), kinds, as_array(mask),
-            as_array(solid),
-        )  # fmt: skip
-        cells, moved, pull = torch.from_numpy(start.cells), torch.from_numpy(start.velocity), start.gravity[:, None]
-        state, pulls = as_grid(start.state, parameters.shape), torch.from_numpy(pull)
+        motion, fields = (as_array(position), as_array(velocity), as_array(gravity)), as_array(values)
+        kinds, sizes = material_rows(material, parameters.materials), np.empty((len(position), 0), np.float32)
+        arrays = ParticleArrays(*motion, as_array(mask), kinds, sizes, fields, as_array(constants), as_array(solid))
+        start = rasterise(parameters, arrays, 0)
+        cells, moved = torch.from_numpy(start.path[:, 0]), torch.from_numpy(start.velocity)
+        pull, state = torch.from_numpy(start.gravity[:, None]), as_grid(start.state, parameters.shape)
         ctx.parameters = parameters
-        ctx.save_for_backward(cells, moved, state, material, mask)
-        ctx.mark_non_differentiable(pulls)
-        return cells, moved, pulls, state
+        ctx.save_for_backward(cells, moved, values, state, material, mask)
+        ctx.mark_non_differentiable(pull)
+        return cells, moved, pull, state
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients with respect to positions and velocities, from those with respect to cells, moved and state."""
+        """Gradients with respect to positions, velocities and fields, from those with respect to the outputs."""
         parameters: KernelParameters = ctx.parameters
-        cells, moved, state, material, mask = ctx.saved_tensors
-        grad_cells, grad_moved, channels = as_copy(grads[0]), as_copy(grads[1]), parameters.volume_channels[1]
-        grad_state = as_copy(grads[3][:, :channels].movedim(1, -1)).reshape(len(cells), -1, channels)
-        rows = as_array(state.movedim(1, -1)).reshape(*grad_state.shape[:2], -1)
-        inputs = as_array(moved), material_rows(material, len(parameters.mass)), as_array(mask), as_array(cells)
+        cells, moved, values, state, material, mask = ctx.saved_tensors
+        dim, count = moved.shape[2], values.shape[2]
+        grad_cells, grad_values = as_copy(grads[0]), np.zeros((*moved.shape[:2], dim + count), np.float32)
+        grad_values[..., :dim] = grads[1].numpy()
+        sums = as_array(_by_material(state, parameters, count))
+        grad_sums = as_copy(_by_material(grads[3], parameters, count)[..., : parameters.materials * (dim + count + 1)])
+        carried = as_array(torch.cat([moved, values], dim=2) if count else moved)
+        inputs = carried, material_rows(material, parameters.materials), as_array(mask), as_array(cells)
         volume = np.float32(parameters.particle_volume)
 
         def follow(b: int) -> None:
-            speeds, kind, real, here = (values[b] for values in inputs)
+            each, kind, real, here = (array[b] for array in inputs)
             rasterise_back(
-                speeds, kind, real, here, parameters.grid, rows[b], volume, parameters.box, grad_state[b],
-                grad_cells[b], grad_moved[b],
+                each, kind, real, here, parameters.grid, sums[b], volume, parameters.box, grad_sums[b], grad_cells[b],
+                grad_values[b],
             )  # fmt: skip
 
         for_each(follow, len(cells), torch.get_num_threads())
-        return None, torch.from_numpy(grad_cells), torch.from_numpy(grad_moved), *(None,) * 4
+        back = torch.from_numpy(grad_values)
+        return None, torch.from_numpy(grad_cells), back[..., :dim], back[..., dim:] if count else None, *(None,) * 5
+
+
+def _by_material(state: Tensor, parameters: KernelParameters, fields: int) -> Tensor:
+    """(B, size, M V + M + ...) a state's means of each material's velocities and fields, then its volume fractions."""
+    (first, end), materials = parameters.volume_channels, parameters.materials
+    rows = state.movedim(1, -1).flatten(1, -2)
+    if not fields:
+        return rows
+    values = rows[..., parameters.first_field : parameters.first_field + materials * fields]
+    both = [part.unflatten(-1, (materials, -1)) for part in (rows[..., :first], values)]
+    return torch.cat([torch.cat(both, -1).flatten(-2), rows[..., first:end]], -1)
 
 
 class FreePath(torch.autograd.Function):
@@ -108,38 +134,39 @@ class FreePath(torch.autograd.Function):
         """(B, m, N, D) positions in cells; tensors as of `BundleStart`, and the network's output and scale."""
         start, fields = _to_arrays(parameters, *tensors)
         check_materials(parameters, start.material)
-        path = np.empty((len(fields), fields.shape[1], *start.cells.shape[1:]), np.float32)
 
         def move(b: int) -> None:
-            find_path(start.scene(b), fields[b], parameters, None, path[b], 1)
+            find_path(start.scene(b), fields[b], parameters, None, 1)
 
-        for_each(move, len(path), torch.get_num_threads())
-        positions = torch.from_numpy(path)
+        for_each(move, len(fields), torch.get_num_threads())
+        path = torch.from_numpy(start.path)
         ctx.parameters = parameters
-        ctx.save_for_backward(*tensors, positions)
-        return positions
+        ctx.save_for_backward(*tensors, path)
+        return path[:, 1:]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients with respect to cells, velocity, state and output."""
         parameters: KernelParameters = ctx.parameters
-        *tensors, positions = ctx.saved_tensors
+        *tensors, path = ctx.saved_tensors
         output, scale = tensors[-2:]
-        (start, fields), path = _to_arrays(parameters, *tensors), as_array(positions)
-        grad_cells, grad_velocity = np.zeros((2, *start.cells.shape), np.float32)
+        start, fields = _to_arrays(parameters, *tensors)
+        start = start._replace(path=as_array(path))
+        grad_path, grad_velocity = np.empty_like(start.path), np.zeros_like(start.velocity)
+        grad_path[:, 0], grad_path[:, 1:] = 0, grad.numpy()
         grad_state, grad_fields = np.zeros_like(start.state), np.zeros_like(fields)
 
         def follow(b: int) -> None:
-            cells, _, _, material, mask, state = start.scene(b)
+            scene = start.scene(b)
             path_back(
-                cells, material, mask, parameters.grid, state, fields[b], parameters.decoder, parameters.bounds,
-                path[b], as_copy(grad[b]), grad_cells[b], grad_velocity[b], grad_state[b], grad_fields[b],
+                scene.path, scene.material, scene.mask, parameters.grid, scene.state, fields[b], parameters.decoder,
+                parameters.bounds, grad_path[b], grad_velocity[b], grad_state[b], grad_fields[b],
             )  # fmt: skip
 
-        for_each(follow, len(path), torch.get_num_threads())
+        for_each(follow, len(fields), torch.get_num_threads())
         to_output = torch.from_numpy(grad_fields).movedim(-1, 2).unflatten(3, parameters.shape)
-        back = torch.from_numpy(grad_cells), torch.from_numpy(grad_velocity), None, None, None
+        back = torch.from_numpy(grad_path[:, 0]), torch.from_numpy(grad_velocity), None, None, None
         return None, *back, as_grid(grad_state, parameters.shape), (to_output * scale).to(output.dtype), None
 
 
@@ -149,36 +176,77 @@ def _to_arrays(
 ) -> tuple[StartArrays, Array]:  # fmt: skip
     """The start, and the fields (B, m, size, C) of an output; tensors as of `FreePath.forward`."""
     rows = as_array(state.movedim(1, -1)).reshape(len(cells), -1, state.shape[1])
-    kinds, pull = material_rows(material, len(parameters.mass)), as_array(gravity)[:, 0]
+    kinds, pull = material_rows(material, parameters.materials), as_array(gravity)[:, 0]
     fields = np.empty((*output.shape[:2], rows.shape[1], output.shape[2]), np.float32)
-    predicted, factors = output_array(output), as_array(scale).reshape(-1)
+    predicted, factors = output_array(output), as_array(scale.flatten(1))
     for_each(lambda b: unpack(predicted[b], factors, fields[b]), len(fields), torch.get_num_threads())
-    return StartArrays(as_array(cells), as_array(velocity), pull, kinds, as_array(mask), rows), fields
+    path = np.empty((len(cells), output.shape[1] + 1, *cells.shape[1:]), np.float32)
+    path[:, 0] = cells.detach().numpy()
+    sizes = np.empty((len(cells), 0), np.float32)
+    return StartArrays(path, as_array(velocity), pull, kinds, as_array(mask), sizes, rows), fields
+
+
+class Gather(torch.autograd.Function):
+    """`Advection.gather` with gradients with respect to field and positions."""
+
+    @staticmethod
+    def forward(ctx: Any, parameters: KernelParameters, field: Tensor, cells: Tensor, material: Tensor) -> Tensor:
+        """(B, N, V) values of a field (B, materials * V, *S) at cells (B, N, D)."""
+        rows, here = as_array(field.movedim(1, -1).flatten(1, -2)), as_array(cells)
+        kinds, values = material_rows(material, parameters.materials), field.shape[1] // parameters.materials
+        gathered = np.empty((*here.shape[:2], values), np.float32)
+
+        def follow(b: int) -> None:
+            gather(rows[b], kinds[b], here[b], parameters.grid, (0,) * values, gathered[b])
+
+        for_each(follow, len(here), torch.get_num_threads())
+        ctx.parameters = parameters
+        ctx.save_for_backward(field, cells, material)
+        return torch.from_numpy(gathered)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients with respect to field and cells."""
+        parameters: KernelParameters = ctx.parameters
+        field, cells, material = ctx.saved_tensors
+        rows, here, pull = as_array(field.movedim(1, -1).flatten(1, -2)), as_array(cells), as_array(grad)
+        kinds, real = material_rows(material, parameters.materials), np.ones(here.shape[1], np.bool_)
+        grad_rows, grad_cells, values = np.zeros_like(rows), np.zeros_like(here), (0,) * pull.shape[2]
+
+        def follow(b: int) -> None:
+            gather_adjoint(
+                rows[b], kinds[b], real, here[b], parameters.grid, values, pull[b], grad_cells[b], grad_rows[b]
+            )
+
+        for_each(follow, len(here), torch.get_num_threads())
+        return None, as_grid(grad_rows, parameters.shape), torch.from_numpy(grad_cells), None
 
 
 @jit
 def path_back(
-    cells: Any, material: Any, mask: Any, grid: Any, state: Any, fields: Any, decoder: Any, bounds: Any, path: Any,
-    grad_path: Any, grad_cells: Any, grad_velocity: Any, grad_state: Any, grad_fields: Any,
+    path: Any, material: Any, mask: Any, grid: Any, state: Any, fields: Any, decoder: Any, bounds: Any, grad_path: Any,
+    grad_velocity: Any, grad_state: Any, grad_fields: Any,
 ) -> Any:  # fmt: skip
     """Add the gradients of what `find_path` starts from; a position stopped at a bound, or of padding, passes none.
 
-    `grad_path` is overwritten; `grad_velocity` must hold zeros; the others are added to.
+    `grad_path` is overwritten, at the start by that of the positions; `grad_velocity` must hold zeros; the others are
+    added to.
     """
-    carries = decoder[3] > ZERO
-    for frame in range(len(path) - 1, -1, -1):
-        grad = grad_path[frame]
-        here, target = (path[frame - 1], grad_path[frame - 1]) if frame > 0 else (cells, grad_cells)
-        if carries and frame > 0:  # the velocity of the frame before is a difference of positions
+    carries, velocities = decoder[3] > ZERO, grid[0]
+    for frame in range(len(path) - 1, 0, -1):
+        here, grad, target = path[frame - 1], grad_path[frame], grad_path[frame - 1]
+        if carries and frame > 1:  # the velocity of the frame before is a difference of positions
             _step_back(path[frame], mask, bounds, grad, target, target)
-            earlier = grad_path[frame - 2] if frame > 1 else grad_cells
+            earlier = grad_path[frame - 2]
             earlier -= grad
         else:
             _step_back(path[frame], mask, bounds, grad, target, grad_velocity)
-        gather_adjoint(fields[frame], material, mask, here, grid[0], grid[1], grad, target, grad_fields[frame])
+        field, grad_field = fields[frame - 1], grad_fields[frame - 1]
+        gather_adjoint(field, material, mask, here, grid, velocities, grad, target, grad_field)
     if decoder[1] != ZERO:
         smoothed = decoder[1] * grad_velocity
-        gather_adjoint(state, material, mask, cells, grid[0], grid[1], smoothed, grad_cells, grad_state)
+        gather_adjoint(state, material, mask, path[0], grid, velocities, smoothed, grad_path[0], grad_state)
     grad_velocity *= decoder[0]
 
 
@@ -197,25 +265,25 @@ def _step_back(cells: Any, mask: Any, bounds: Any, grad: Any, grad_before: Any, 
 
 @jit
 def rasterise_back(
-    moved: Any, material: Any, mask: Any, cells: Any, grid: Any, state: Any, particle_volume: Any, box: Any,
-    grad_state: Any, grad_cells: Any, grad_moved: Any,
+    values: Any, material: Any, mask: Any, cells: Any, grid: Any, state: Any, particle_volume: Any, box: Any,
+    grad_state: Any, grad_cells: Any, grad_values: Any,
 ) -> Any:  # fmt: skip
     """Turn gradients with respect to cells and velocities in cells into those in domain length, the state's added.
 
-    `moved` are the velocities (N, D) in cells, `grad_state` (size, M D + M) is of the state's first channels; all three
-    gradients are changed.
+    `values` (N, V) are velocities in cells and fields, `grad_state` (size, M V + M) is of their means and of volume
+    fractions, as `state`; all three gradients are changed.
     """
-    width = moved.shape[1]
+    width = values.shape[1]
     materials = grad_state.shape[1] // (width + 1)
     for node in range(len(grad_state)):
         for kind in range(materials):
             volume = materials * width + kind
             count = state[node, volume] / particle_volume
             for k in range(kind * width, (kind + 1) * width):
-                grad_state[node, k] /= count if count > ZERO else ONE
+                grad_state[node, k] /= count if count > np.float32(LEAST_SHARE) else ONE
             grad_state[node, volume] *= particle_volume
-    scatter_adjoint(moved, material, mask, cells, grid[0], grid[1], state, grad_state, grad_cells, grad_moved)
+    scatter_adjoint(values, material, mask, cells, grid, state, grad_state, grad_cells, grad_values)
     for p in range(len(grad_cells)):
-        for d in range(width):
+        for d in range(cells.shape[1]):
             grad_cells[p, d] /= box[1, d]
-            grad_moved[p, d] /= box[1, d]
+            grad_values[p, d] /= box[1, d]

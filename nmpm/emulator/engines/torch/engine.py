@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -25,7 +24,7 @@ class TorchEngine(Engine[BundleStart, Tensor]):
 
     def rasterise(self, particles: Particles, context: RolloutContext) -> BundleStart:
         cells, velocity, gravity, state = self.grid_state(particles, context.solid)
-        return BundleStart(particles, cells, velocity, gravity, state, self._solids_ahead(particles))
+        return BundleStart(particles, cells, velocity, gravity, state, self.solids_ahead(particles))
 
     def grid_state(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Positions (B, N, D), velocities (B, N, D) and gravity (B, 1, D) in cells; grid state (B, C_in, *S)."""
@@ -49,9 +48,9 @@ class TorchEngine(Engine[BundleStart, Tensor]):
         fields: Mapping[str, Tensor] = {}
         if emulator.scene.evolving:
             rates = output[:, :, velocities:].to(emulator.precision) * emulator.output_scale[:, velocities:]
-            before = torch.cat([start.cells.unsqueeze(1), path[:, :-1]], dim=1)
-            gather = partial(Advection(emulator).gather, material=start.material)
-            fields = emulator.field_scales.evolve(start.particles, before, rates, gather)
+            before = (start.cells, *path[:, :-1].unbind(1))
+            steps = [self.gather(*both, start.material) for both in zip(rates.unbind(1), before, strict=True)]
+            fields = emulator.field_scales.evolve(start.particles.fields, torch.stack(steps, dim=1).cumsum(1))
         return Flight(path, path[:, -1] - (path[:, -2] if emulator.frames > 1 else start.cells), fields)
 
     def path(self, start: BundleStart, output: Tensor, context: RolloutContext) -> Tensor:
@@ -63,6 +62,10 @@ class TorchEngine(Engine[BundleStart, Tensor]):
             path = advection.constrained_path(start, fields, context.solid, context.budget)
         advection.check_bounds(start, path)
         return path
+
+    def gather(self, field: Tensor, cells: Tensor, material: Tensor) -> Tensor:
+        """As `Advection.gather`."""
+        return Advection(self.emulator).gather(field, cells, material)
 
     def velocities(self, output: Tensor) -> Tensor:
         """(B, m, materials * D, *S) in cells per frame."""
@@ -76,14 +79,3 @@ class TorchEngine(Engine[BundleStart, Tensor]):
         grid, precision = self.emulator.grid, start.particles.position.dtype
         position, velocity = grid.to_length(flight.path.to(precision)), grid.to_displacement(flight.step.to(precision))
         return Bundle(position, velocity, flight.fields)
-
-    def _solids_ahead(self, particles: Particles) -> Tensor | None:
-        """(B, m, *S) solid fraction at each frame, of obstacles that keep their velocity; None where none moves."""
-        model, velocity = self.emulator, particles.obstacle_velocity
-        if velocity is None or model.training or not (model.scene.obstacles and model.constraints.solids):
-            return None
-        at_frames = (
-            dataclasses.replace(particles, obstacle=particles.obstacle + frame * velocity)
-            for frame in range(1, model.frames + 1)
-        )
-        return torch.cat([model.solid(there) for there in at_frames], dim=1)
