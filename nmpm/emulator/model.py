@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import logging
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self
@@ -43,7 +42,6 @@ if TYPE_CHECKING:
 
 NETWORK_PRECISIONS: Mapping[str, torch.dtype] = MappingProxyType({"float32": torch.float32, "bfloat16": torch.bfloat16})
 """Precisions of the network in rollouts, by name; everything else computes in float32."""
-_LOG = logging.getLogger(__name__)
 UNLIMITED = 1e30
 """Stands for no limit, finite so that every statistic of a valid model is."""
 COMPILED = "processor._orig_mod."
@@ -290,20 +288,3 @@ def _with_plain_names(_module: nn.Module, state: dict[str, Any], prefix: str, _l
     """Save a network that is wrapped by `torch.compile` as the plain one."""
     for name in [name for name in state if name.startswith(prefix + COMPILED)]:
         state[f"{prefix}processor.{name.removeprefix(prefix + COMPILED)}"] = state.pop(name)
-
-
-def compile_network(network: GridProcessor, grid: Tensor) -> bool:
-    """Compile a network in place, so that names of weights stay, and try it on a grid state (B, C_in, *S).
-
-    Returns:
-        Whether it is compiled. Without a compiler, or if the network cannot be traced, it stays as it was.
-    """
-    network.compile()
-    try:
-        with torch.no_grad():
-            network(grid)
-    except Exception as error:  # (compilers document no exceptions)
-        network._compiled_call_impl = None
-        _LOG.warning("The network is not compiled: %s", str(error).splitlines()[0][:200])
-        return False
-    return True

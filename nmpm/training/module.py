@@ -24,7 +24,6 @@ from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, Prescribed, Rollout
 from nmpm.emulator.calibration import calibrate, calibrate_unread, unread_inputs
 from nmpm.emulator.fields import warn_of_ignored
-from nmpm.emulator.model import compile_network
 from nmpm.emulator.recipe import FORMAT, check_format
 from nmpm.emulator.rollouts import recomputed, unroll_with_gradients
 from nmpm.errors import ConfigError
@@ -176,7 +175,7 @@ class EmulatorModule(EvaluatedModule):
             self.trainer.strategy.setup_optimizers(self.trainer)
         if self.compiled:
             example = self.emulator.input_mean.expand(1, -1, *self.emulator.grid.shape)
-            compile_network(self.emulator.processor, example)
+            preflight.compile_network(self.emulator.processor, example)
 
     def on_train_start(self) -> None:
         preflight.warn_of_slow_precision(self.trainer)

@@ -6,6 +6,7 @@ Lightning itself rejects further options when the Trainer is made. `docs/lightni
 from __future__ import annotations
 
 import copy
+import logging
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -26,6 +27,7 @@ from lightning.pytorch.callbacks import (
 )
 from lightning.pytorch.strategies import ModelParallelStrategy
 from lightning.pytorch.utilities import rank_zero_warn
+from torch import Tensor
 from torchmetrics import Metric
 
 from nmpm._support.devices import computes_bfloat16
@@ -37,11 +39,12 @@ from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.comparison import Comparison, still
-from nmpm.processors import UNet
+from nmpm.processors import GridProcessor, UNet
 
 if TYPE_CHECKING:
     from nmpm.training.module import EmulatorModule
 
+_LOG = logging.getLogger(__name__)
 OVERALL = "overall"
 """Name of the validation error by which the best checkpoint is chosen, see `overall_error`."""
 FLOAT32, BFLOAT16 = "32-true", ("bf16", "bf16-mixed")
@@ -262,3 +265,20 @@ def check_disk(trainer: Trainer, module: LightningModule) -> None:
             raise ConfigError(message)
         if free < 2 * needed:
             rank_zero_warn(message)
+
+
+def compile_network(network: GridProcessor, grid: Tensor) -> bool:
+    """Compile a network in place, so that names of weights stay, and try it on a grid state (B, C_in, *S).
+
+    Returns:
+        Whether it is compiled. Without a compiler, or if the network cannot be traced, it stays as it was.
+    """
+    network.compile()
+    try:
+        with torch.no_grad():
+            network(grid)
+    except Exception as error:  # (compilers document no exceptions)
+        network._compiled_call_impl = None
+        _LOG.warning("The network is not compiled: %s", str(error).splitlines()[0][:200])
+        return False
+    return True

@@ -115,7 +115,9 @@ def train(folder, calls: list[str], **options) -> dict[str, Any]:
 @pytest.mark.parametrize("name", marked(CHANGED_MODEL))
 def test_model(name, folder, monkeypatch):
     compiled: list[str] = []  # networks that were to be compiled, which is not done
-    monkeypatch.setattr(training_module, "compile_network", lambda network, _: compiled.append(type(network).__name__))
+    monkeypatch.setattr(
+        training_module.preflight, "compile_network", lambda network, _: compiled.append(type(network).__name__)
+    )
     monkeypatch.setattr(training_module, "can_record", lambda _: bool(compiled.append("recorded")))  # likewise
     common = {"position_noise": 1e-3} if name == "seed" else {}
     before = train(folder, compiled, **common)

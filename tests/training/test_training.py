@@ -212,7 +212,7 @@ def test_a_compiled_network_trains_to_the_same_weights_and_a_broken_compiler_is_
             network._compiled_call_impl = broken
 
     # Not by caplog: other tests of the same process may have switched loggers off.
-    monkeypatch.setattr("nmpm.emulator.model._LOG.warning", lambda *words: complaints.append(words))
+    monkeypatch.setattr("nmpm.training.preflight._LOG.warning", lambda *words: complaints.append(words))
     torch.compiler.reset()  # after many compilations of other tests it would compile no more
     monkeypatch.setattr(torch.nn.Module, "compile", compile_network)
     data = data_of(make_dataset())
