@@ -12,9 +12,10 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from scenes import box, cloud
+from scenes import box, cloud, with_obstacle
 
 from nmpm.cli import main
+from nmpm.data.initial_states import lattice
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.rollouts import unroll
@@ -120,6 +121,17 @@ def test_an_onnx_step_is_the_emulator_for_any_number_of_scenes_and_particles(nam
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_particles_keep_clear_of_obstacles_in_an_onnx_step(tmp_path):
+    emulator, path = emulator_of(box(obstacles=True), Constraints(), gain=0.3), tmp_path / "contact.onnx"
+    step, slab = Step(emulator), lattice(((0.3, 0.7), (0.35, 0.5)), 0.02)
+    FORMATS["onnx"].write(step, description(step, "mine", "made up"), path)
+    state = with_obstacle(cloud(emulator.scene, 25, 3, speed=0.02), slab)
+    expected, session = path_of(emulator, state, 3), session_of(path)
+    assert apart(emulator, path_of(emulator.unconstrained(), state, 3), expected) > 1
+    assert apart(emulator, rolled_out(session, inputs_of(step, state), 3), expected) < 1e-4
+
+
 def test_an_onnx_step_takes_a_budget_and_gives_the_one_that_it_kept(exported):
     emulator, path = exported(HELD)
     step, session, particles = Step(emulator), session_of(path), cloud(emulator.scene, 40, 2)
@@ -206,10 +218,6 @@ class Deciding(Processor):
 
 
 def test_what_cannot_be_exported_is_said(tmp_path):
-    with pytest.raises(
-        ConfigError, match=r"do not carry: contact with obstacles \(constraints.solids\): export with --free"
-    ):
-        Step(emulator_of(box(obstacles=True), Constraints()))
     with pytest.raises(ConfigError, match="do not carry: bounds: error: export with --free"):
         Step(emulator_of(box(), Constraints(bounds="error")))
     write = FORMATS["onnx"].write
@@ -261,7 +269,6 @@ def test_a_file_that_differs_from_its_model_is_deleted(tmp_path, monkeypatch, ca
         (["export", "nothing.ckpt"], "there is no such checkpoint"),
         (["export", "goop", "--format", "pt2", "--out", "goop.onnx"], "its name must end in .pt2"),
         (["export", "goop", "--out", "nowhere/goop.onnx"], "the folder nowhere does not exist"),
-        (["export", "waterramps"], "export with --free"),
         (["export", "goop", "--device", "cuda"], "ONNX files run on any device"),
     ],
 )

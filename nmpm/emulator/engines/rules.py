@@ -213,11 +213,6 @@ EXPORTS: tuple[Rule[Emulator], ...] = (
     Rule("fields", (), lambda m: bool(m.scene.fields), "use it in Python, or train one with data.fields=[]"),
     Rule("obstacles that move", (), lambda model: model.scene.moving_obstacles, "use it in Python"),
     Rule("open axes", (), lambda model: "open" in model.scene.boundary, "use it in Python"),
-    # In as many pieces as the fastest particle needs, while a program has a fixed number.
-    Rule(
-        "contact with obstacles (constraints.solids)", ("network", "solid"),
-        lambda model: model.constraints.solids and model.scene.obstacles, _FREE,
-    ),
     Rule("bounds: error", ("network", "solid"), lambda model: model.constraints.bounds == "error", _FREE),
 )  # fmt: skip
 """What exported files of a call ("step"), the network alone and the obstacles' cells ("solid") carry."""

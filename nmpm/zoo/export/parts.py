@@ -74,8 +74,7 @@ class Step(Part):
     """One call of the emulator: from a state to the next m frames and the state after them.
 
     Raises:
-        ConfigError: if the emulator has constraints that a program cannot decide: contact with obstacles, or an error
-            at the bounds.
+        ConfigError: if the emulator raises errors at the bounds, which a program cannot.
     """
 
     def __init__(self, emulator: Emulator) -> None:

@@ -53,10 +53,11 @@ class Advection:
     def constrained_path(self, start: BundleStart, fields: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
         """(B, m, N, D) positions that obey the constraints; solid and budget are those of the `RolloutContext`."""
         path = self.free_path(start, fields, self._limit(start, budget))
-        if self.emulator.constraints.solids and self.emulator.scene.obstacles:
-            path = self._keep_clear(start, path, solid)
+        obstacle = obstacle_share(solid, self.emulator.walls) if self.emulator.scene.obstacles else None
+        if self.emulator.constraints.solids and obstacle is not None:
+            path = self._keep_clear(start, path, obstacle)
         if self.emulator.constraints.rest_speed:
-            path = self._bring_to_rest(start, path, solid)
+            path = self._bring_to_rest(start, path, obstacle)
         return path
 
     def spread_path(self, start: BundleStart, path: Tensor, solid: Tensor, budget: Tensor | None) -> Tensor:
@@ -109,11 +110,10 @@ class Advection:
         excess = limit.excess(*self.emulator.grid.isotropic_units(cells, arrived - cells, before))
         return arrived if excess is None else self._confine(torch.lerp(arrived, cells, excess))
 
-    def _keep_clear(self, start: BundleStart, path: Tensor, solid: Tensor) -> Tensor:
+    def _keep_clear(self, start: BundleStart, path: Tensor, obstacle: Tensor) -> Tensor:
         """The path (B, m, N, D) outside of obstacles; of those that move, where they are in each frame."""
         if start.solids is None:
-            contact = Contact(obstacle_share(solid, self.emulator.walls), self.emulator.grid)
-            return self._confine(contact.hold(start.cells, path, start.mask))
+            return self._confine(Contact(obstacle, self.emulator.grid).hold(start.cells, path, start.mask))
         cells, held = start.cells, []
         steps = path.diff(dim=1, prepend=cells.unsqueeze(1))
         for step, there in zip(steps.unbind(1), start.solids.unsqueeze(2).unbind(1), strict=True):
@@ -122,13 +122,12 @@ class Advection:
             held.append(cells)
         return torch.stack(held, dim=1)
 
-    def _bring_to_rest(self, start: BundleStart, path: Tensor, solid: Tensor) -> Tensor:
+    def _bring_to_rest(self, start: BundleStart, path: Tensor, obstacle: Tensor | None) -> Tensor:
         """The path (B, m, N, D), on which particles at rest stay if something holds them up, and fall otherwise."""
         emulator = self.emulator
         still = at_rest(start.cells, path, emulator.constraints.rest_speed, start.gravity)
         if is_eager_cpu(still) and not bool(still.any()):
             return path
-        obstacle = obstacle_share(solid, emulator.walls) if emulator.scene.obstacles else None
         support = Support(start.filled(len(emulator.scene.materials)), obstacle, emulator.scene, emulator.grid)
         fallen = start.cells.unsqueeze(1) + drops(start.gravity, path.shape[1])
         held = support.holds(start.cells, fallen[:, -1], start.gravity)[:, None, :, None]

@@ -95,9 +95,8 @@ def affordable_share(before: Tensor, after: Tensor, budget: Tensor) -> Tensor:
     From energies (B, F) of both paths' frames and the allowed energy (B,); exactly 1 where the end is within it.
     """
     budget = budget.unsqueeze(1)
-    rise, room = after - before, (budget - before).clamp(min=0)
-    part = room / torch.where(rise > 0, rise, 1.0)
-    return torch.where(after > budget, part * (rise > 0), 1.0).amin(1)
+    part = (budget - before).clamp(min=0) / (after - before).clamp(min=torch.finfo(after.dtype).eps ** 2)
+    return torch.where(after > budget, part, 1.0).amin(1)
 
 
 def _smallest_cut(kinetic: Tensor, fall: Tensor, over: Tensor) -> tuple[Tensor, Tensor]:
