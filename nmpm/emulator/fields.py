@@ -78,7 +78,7 @@ class FieldScales(nn.Module):
             return self.mean.new_zeros(len(particles.mask), 1)
         return (particles.fields[name].to(self.mean.dtype) - self.mean[index]) / self.std[index]
 
-    def evolve(self, begun: Mapping[str, Tensor], gained: Tensor) -> Mapping[str, Tensor]:
+    def evolve(self, begun: Mapping[str, Tensor], gained: Tensor) -> dict[str, Tensor]:
         """The evolving fields in the frames of a bundle, (B, m, N) by name, from those at its start.
 
         `gained` (B, m, N, E) are the sums of the rates since then, in units of the fields' spread.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.jit import jit
-from nmpm.emulator.engines.numba.nodes import ONE, ZERO, corners, linear_nodes, stencil, weight_slope
+from nmpm.emulator.engines.numba.nodes import ONE, ZERO, linear_nodes, stencil, weight_slope
 
 index = np.uint64
 """Of what is not negative: Numba checks signed indices for counting from the end, which costs a quarter of the time."""
@@ -104,7 +104,9 @@ def gather_adjoint(
         if not mask[p]:
             continue
         first = len(values) * material[p] if len(material) else 0
-        a, b, c, d, x, y = corners(cells, p, shape, wraps)
+        i0, i1, x = linear_nodes(cells[p, 0], shape[0], wraps[0])
+        j0, j1, y = linear_nodes(cells[p, 1], shape[1], wraps[1])
+        a, b, c, d = i0 * shape[1] + j0, i0 * shape[1] + j1, i1 * shape[1] + j0, i1 * shape[1] + j1
         at_a, at_b, at_c, at_d = ZERO, ZERO, ZERO, ZERO
         for k in range(len(values) - 1, -1, -1):
             grad, column = grad_out[p, k], first + k

@@ -75,18 +75,6 @@ def linear_nodes(x: Any, count: Any, wraps: Any) -> Any:
 
 
 @jit
-def corners(cells: Any, p: Any, shape: Any, wraps: Any) -> Any:
-    """The four nodes around a particle along the first two axes, and the weights of the upper ones along each."""
-    if wraps[0] or wraps[1]:
-        i0, i1, x = linear_nodes(cells[p, 0], shape[0], wraps[0])
-        j0, j1, y = linear_nodes(cells[p, 1], shape[1], wraps[1])
-    else:  # with constants, which the compiler makes use of
-        i0, i1, x = linear_nodes(cells[p, 0], shape[0], False)
-        j0, j1, y = linear_nodes(cells[p, 1], shape[1], False)
-    return i0 * shape[1] + j0, i0 * shape[1] + j1, i1 * shape[1] + j0, i1 * shape[1] + j1, x, y
-
-
-@jit
 def scatter_nodes(x: Any, count: Any, wraps: Any) -> Any:
     """As `linear_nodes`, but a NaN is passed on to the grid, on a wall axis at its first node."""
     if np.isnan(x) and not wraps:

@@ -63,9 +63,10 @@ class NumbaTraining(TorchEngine):
         )  # fmt: skip
         return path
 
-    def gather(self, field: Tensor, cells: Tensor, material: Tensor) -> Tensor:
-        values: Tensor = Gather.apply(self.parameters, field, cells, material)  # type: ignore[no-untyped-call]
-        return values
+    def gains(self, start: BundleStart, path: Tensor, rates: Tensor) -> Tensor:
+        before = torch.cat([start.cells.unsqueeze(1), path[:, :-1]], dim=1)
+        steps: Tensor = Gather.apply(self.parameters, rates, before, start.material)  # type: ignore[no-untyped-call]
+        return steps.cumsum(1)
 
 
 class Rasterise(torch.autograd.Function):
@@ -187,40 +188,41 @@ def _to_arrays(
 
 
 class Gather(torch.autograd.Function):
-    """`Advection.gather` with gradients with respect to field and positions."""
+    """Interpolation of grid values at each frame, with gradients with respect to values and positions."""
 
     @staticmethod
-    def forward(ctx: Any, parameters: KernelParameters, field: Tensor, cells: Tensor, material: Tensor) -> Tensor:
-        """(B, N, V) values of a field (B, materials * V, *S) at cells (B, N, D)."""
-        rows, here = as_array(field.movedim(1, -1).flatten(1, -2)), as_array(cells)
-        kinds, values = material_rows(material, parameters.materials), field.shape[1] // parameters.materials
-        gathered = np.empty((*here.shape[:2], values), np.float32)
+    def forward(ctx: Any, parameters: KernelParameters, fields: Tensor, cells: Tensor, material: Tensor) -> Tensor:
+        """(B, m, N, V) each particle's own material's values, of fields (B, m, materials * V, *S) at (B, m, N, D)."""
+        rows, kinds = as_array(fields.movedim(2, -1).flatten(2, -2)), material_rows(material, parameters.materials)
+        here, values = as_array(cells), (0,) * (fields.shape[2] // parameters.materials)
+        gathered = np.empty((*here.shape[:3], len(values)), np.float32)
 
         def follow(b: int) -> None:
-            gather(rows[b], kinds[b], here[b], parameters.grid, (0,) * values, gathered[b])
+            for frame in range(len(here[b])):
+                gather(rows[b, frame], kinds[b], here[b, frame], parameters.grid, values, gathered[b, frame])
 
         for_each(follow, len(here), torch.get_num_threads())
         ctx.parameters = parameters
-        ctx.save_for_backward(field, cells, material)
+        ctx.save_for_backward(torch.from_numpy(rows), cells, material)
         return torch.from_numpy(gathered)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        """Gradients with respect to field and cells."""
+        """Gradients with respect to fields and cells."""
         parameters: KernelParameters = ctx.parameters
-        field, cells, material = ctx.saved_tensors
-        rows, here, pull = as_array(field.movedim(1, -1).flatten(1, -2)), as_array(cells), as_array(grad)
-        kinds, real = material_rows(material, parameters.materials), np.ones(here.shape[1], np.bool_)
-        grad_rows, grad_cells, values = np.zeros_like(rows), np.zeros_like(here), (0,) * pull.shape[2]
+        rows, here, pull = as_array(ctx.saved_tensors[0]), as_array(ctx.saved_tensors[1]), as_array(grad)
+        kinds, real = material_rows(ctx.saved_tensors[2], parameters.materials), np.ones(here.shape[2], np.bool_)
+        grad_rows, grad_cells, values = np.zeros_like(rows), np.zeros_like(here), (0,) * pull.shape[3]
 
         def follow(b: int) -> None:
-            gather_adjoint(
-                rows[b], kinds[b], real, here[b], parameters.grid, values, pull[b], grad_cells[b], grad_rows[b]
-            )
+            for frame in range(len(here[b])):
+                at, back = (here[b, frame], parameters.grid, values), (grad_cells[b, frame], grad_rows[b, frame])
+                gather_adjoint(rows[b, frame], kinds[b], real, *at, pull[b, frame], *back)
 
         for_each(follow, len(here), torch.get_num_threads())
-        return None, as_grid(grad_rows, parameters.shape), torch.from_numpy(grad_cells), None
+        to_fields = torch.from_numpy(grad_rows).movedim(-1, 2).unflatten(3, parameters.shape)
+        return None, to_fields, torch.from_numpy(grad_cells), None
 
 
 @jit

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -44,13 +43,13 @@ class TorchEngine(Engine[BundleStart, Tensor]):
 
     def fly(self, start: BundleStart, output: Tensor, context: RolloutContext) -> Flight[Tensor]:
         emulator, velocities = self.emulator, self.emulator.scene.dim * len(self.emulator.scene.materials)
-        path = self.path(start, output[:, :, :velocities], context)  # the other channels are rates of fields
-        fields: Mapping[str, Tensor] = {}
+        flows, fields = output, dict[str, Tensor]()
         if emulator.scene.evolving:
-            rates = output[:, :, velocities:].to(emulator.precision) * emulator.output_scale[:, velocities:]
-            before = (start.cells, *path[:, :-1].unbind(1))
-            steps = [self.gather(*both, start.material) for both in zip(rates.unbind(1), before, strict=True)]
-            fields = emulator.field_scales.evolve(start.particles.fields, torch.stack(steps, dim=1).cumsum(1))
+            flows, rates = output.split([velocities, output.shape[2] - velocities], dim=2)
+        path = self.path(start, flows, context)
+        if emulator.scene.evolving:
+            gains = self.gains(start, path, rates.to(emulator.precision) * emulator.output_scale[:, velocities:])
+            fields = emulator.field_scales.evolve(start.particles.fields, gains)
         return Flight(path, path[:, -1] - (path[:, -2] if emulator.frames > 1 else start.cells), fields)
 
     def path(self, start: BundleStart, output: Tensor, context: RolloutContext) -> Tensor:
@@ -63,9 +62,11 @@ class TorchEngine(Engine[BundleStart, Tensor]):
         advection.check_bounds(start, path)
         return path
 
-    def gather(self, field: Tensor, cells: Tensor, material: Tensor) -> Tensor:
-        """As `Advection.gather`."""
-        return Advection(self.emulator).gather(field, cells, material)
+    def gains(self, start: BundleStart, path: Tensor, rates: Tensor) -> Tensor:
+        """(B, m, N, E) sums of the rates (B, m, materials * E, *S) that particles meet before each frame's step."""
+        gather, before = Advection(self.emulator).gather, (start.cells, *path[:, :-1].unbind(1))
+        steps = [gather(rate, cells, start.material) for rate, cells in zip(rates.unbind(1), before, strict=True)]
+        return torch.stack(steps, dim=1).cumsum(1)
 
     def velocities(self, output: Tensor) -> Tensor:
         """(B, m, materials * D, *S) in cells per frame."""
