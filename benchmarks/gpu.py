@@ -1,4 +1,4 @@
-"""Run all that needs a GPU with one command: a training, the tests, the benchmarks, the zoo's models.
+"""Run all that needs a GPU with one command: kernels' tests first, rollouts and training steps, then all the rest.
 
 python benchmarks/gpu.py --out runs/gpu
 python benchmarks/gpu.py --out runs/gpu --dry-run            print the commands
@@ -24,8 +24,10 @@ from nmpm.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parent.parent
 STATUS = "exit status "
-TESTS = ("tests/test_on_device.py", "tests/emulator/test_gpu.py", "tests/processors", "tests/transfer")
-"""What `--device` changes."""
+KERNELS = ("tests/emulator/test_gpu.py", "tests/training/test_recorded_steps.py")
+"""Of kernels in Triton and of CUDA graphs, which few GPUs have run."""
+TESTS = ("tests/test_on_device.py", "tests/processors", "tests/transfer")
+"""What else `--device` changes."""
 LARGE_GRIDS = ("64x64", "256x256", "1024x1024", "64x64x64", "128x128x128")
 
 
@@ -35,11 +37,12 @@ def list_steps(device: str, out: Path) -> dict[str, list[str]]:
     compared = ["compare", "goop", "--data", "goop"]
     ablation = ["benchmarks/sweeps/parts.yaml", "--minutes", "3", "--out", str(out / "parts")]
     return {
+        "kernels": _python("-m", "pytest", "--device", device, *KERNELS),
+        "rollouts": _benchmark("gpu_rollouts", device, "--batches", "1", "64"),
+        "training_step": _benchmark("training_step", device, "--batch", "128", "--rounds", "20"),
         "fit": _python("-m", "nmpm", "fit", "--config", "goop.yaml"),
         "tests": _python("-m", "pytest", "--device", device, *TESTS),
-        "training_step": _benchmark("training_step", device, "--batch", "128", "--rounds", "20"),
         "scaling": _benchmark("scaling", device, *sizes),
-        "rollouts": _benchmark("gpu_rollouts", device, "--batches", "1", "64"),
         "compare": _python("-m", "nmpm", *compared, "--wider", "2", "--device", device, "--out", str(out / "compare")),
         "streaming": _python("benchmarks/streaming.py"),
         "ablation": _benchmark("ablation", device, *ablation),
