@@ -51,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
         return command
 
     add_command(_list, "names, data and full-rollout errors of the models")
-    card = add_command(_card, "errors, times, training and known failures of one model")
+    card = add_command(_card, "errors, times, training and known failures of one model, and what computes it here")
     card.add_argument("name", help=_MODEL)
     card.add_argument("--yaml", action="store_true", help="everything known of it, for programs")
     zoo_match.add_arguments(add_command(zoo_match.match, zoo_match.ABOUT))
