@@ -191,6 +191,14 @@ def test_non_finite_inputs_stay_visible(name, bad, walls):
         torch.testing.assert_close(fused[:, 0, far], tensors[:, 0, far], rtol=1e-3, atol=LIMIT, equal_nan=True)
 
 
+def test_a_field_that_is_not_finite_spreads_as_far():
+    scene, particles = with_extras(box(), cloud(box(), 50), fields=True)
+    particles.fields["temperature"][0, 3] = float("nan")
+    fused, tensors = predict_both(emulator_of(scene, cells=12), particles)
+    assert not fused[:, 0, 3].isfinite().all()
+    torch.testing.assert_close(fused, tensors, rtol=1e-3, atol=LIMIT, equal_nan=True)
+
+
 @pytest.mark.parametrize("transfer", [Nearest(), Linear(), Quadratic()])
 @pytest.mark.parametrize("kernels", [True, False], ids=["kernels", "tensors"])
 def test_padding_changes_nothing_to_the_bit_however_fast_and_wherever_it_is(kernels, transfer):

@@ -1,9 +1,7 @@
-"""The steps around the network as Numba kernels on a CPU: rollouts without gradients (`call`), trainings (`autograd`).
+"""The steps around the network as Numba kernels on a CPU: rollouts (`engine`), trainings with gradients (`training`).
 
-They give what the tensor operations of `nmpm.emulator.rasterise`, `advection`, `constraints`, `contact`, `support` and
-`crowding` give, to rounding, in a tenth of the time. Those stay for everything else: other gradients, other devices,
-float64, the parts of other packages, exported programs. `with nmpm.transfer.without_kernels():` chooses them
-everywhere.
+They give what the torch engine gives, to rounding, in a tenth of the time; `nmpm.emulator.engines.rules` says for which
+models and calls. `with nmpm.transfer.without_kernels():` chooses the torch engine everywhere.
 
 Kernels take the arrays of one scene, C-contiguous and of float32 unless said otherwise, in cells and cells per frame:
 

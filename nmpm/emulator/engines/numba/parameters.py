@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
-_P2G_NODES: Mapping[type[Transfer], int] = MappingProxyType({Nearest: 1, Linear: 2, Quadratic: 3})
-_G2P_NODES: Mapping[type[Transfer], int] = MappingProxyType({Nearest: 2, Linear: 2, Quadratic: 3})
-"""Nodes along an axis."""
+_NODES: Mapping[type[Transfer], tuple[int, int]] = MappingProxyType(
+    {Nearest: (1, 2), Linear: (2, 2), Quadratic: (3, 3)}
+)
+"""Nodes along an axis, of p2g and of g2p."""
 
 _DECODERS: Mapping[type[Decoder], Callable[[Any], tuple[float, ...]]] = MappingProxyType(
     {
@@ -97,7 +98,7 @@ class KernelParameters:
 def kernel_parameters(recipe: EmulatorRecipe) -> KernelParameters:
     """The parameters of a recipe of which engines with kernels compute all, see `nmpm.emulator.engines.rules`."""
     scene, grid, constraints = recipe.scene, recipe.grid, recipe.constraints
-    transfer, decoder = type(recipe.transfer), type(recipe.decoder)
+    (p2g, g2p), decoder = _NODES[type(recipe.transfer)], type(recipe.decoder)
     spacing = np.array(grid.spacing)
     low, high = (np.array(scene.bounds).T - np.array(grid.lower)) / spacing
     low, high = np.where(scene.confined, low, -np.inf), np.where(scene.confined, high, np.inf)
@@ -110,8 +111,8 @@ def kernel_parameters(recipe: EmulatorRecipe) -> KernelParameters:
         bounds=np.array((low, high, np.full(scene.dim, constraints.bounds == "reflect")), np.float32),
         ratio=np.where(is_square, 1.0, ratio).astype(np.float32),
         grid=(grid.shape, grid.periodic, (0, 0)),
-        p2g_grid=(grid.shape, grid.periodic, (0,) * _P2G_NODES[transfer]),
-        g2p_grid=(grid.shape, grid.periodic, (0,) * _G2P_NODES[transfer]),
+        p2g_grid=(grid.shape, grid.periodic, (0,) * p2g),
+        g2p_grid=(grid.shape, grid.periodic, (0,) * g2p),
         size=grid.size,
         particle_volume=scene.particle_volume / grid.cell_volume,
         mass=np.array(scene.densities or (1.0,) * len(scene.materials), np.float32),

@@ -1,9 +1,8 @@
 """The steps around the network with gradients, for trainings on a CPU: p2g, and the free way through a bundle.
 
-They are for linear transfers and bounds that stop particles, in 2-D (`KernelParameters.trains`). Each scene of a batch
-is a thread's work, so that results do not depend on the number of threads. Second derivatives are an error. Torch's
-operators with gradients (`torch.library.register_autograd`) take 0.2 ms a call more than these functions, as long as
-the kernels.
+They are for linear transfers and bounds that stop particles, in 2-D. Each scene of a batch is a thread's work, so that
+results do not depend on the number of threads. Second derivatives are an error. Torch's operators with gradients
+(`torch.library.register_autograd`) take 0.2 ms a call more than these functions, as long as the kernels.
 """
 
 from __future__ import annotations
