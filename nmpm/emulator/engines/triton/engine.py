@@ -18,7 +18,7 @@ from nmpm.emulator.engines.torch.crowding import CLOSED, MAX_SHIFT, SWEEPS
 from nmpm.emulator.engines.torch.start import BundleStart
 from nmpm.emulator.engines.torch.support import ENOUGH, MAX_DROP, REACH
 from nmpm.emulator.engines.triton import contact, crowding, grid, launch, motion, rest
-from nmpm.emulator.engines.triton.launch import axes, blocks, decoding, power, programs, walls, warps
+from nmpm.emulator.engines.triton.launch import axes, blocks, decoding, power, programs, walls, warps, whole
 from nmpm.particles import Particles
 
 _COLUMNS = 16
@@ -144,7 +144,7 @@ class TritonEngine(Engine[TritonStart, Tensor]):
     def _move(self, start: TritonStart, output: Tensor, budget: Tensor | None) -> Tensor:
         """Fill in the path; (B, programs) squares of the longest steps."""
         model, (batch, _, count, _) = self.emulator, start.path.shape
-        block, path = launch.BLOCK if budget is None else power(count), start.path[:, 1:]
+        block, path = launch.BLOCK if budget is None else whole(count), start.path[:, 1:]
         squares = path.new_empty(batch, -(-count // block))
         numbers, options = self._moving(output)
         motion.flight[squares.shape[1], batch](
@@ -206,7 +206,7 @@ class TritonEngine(Engine[TritonStart, Tensor]):
 
     def _flow(self, start: TritonStart, context: RolloutContext) -> Tensor:
         """(B, *S, 2) displacements at the nodes that spread overfull cells at the path's end."""
-        params, path, block = self.parameters, start.path, power(self.parameters.size)
+        params, path, block = self.parameters, start.path, whole(self.parameters.size)
         counts, flow = path.new_empty(3, len(path), params.size), path.new_empty(len(path), *params.shape, 2)
         crowding.press[len(path),](
             path, start.volume, *self._taken(context), counts[0], counts[1:], flow, *self._crowd, path.shape[2],
@@ -255,7 +255,7 @@ class TritonEngine(Engine[TritonStart, Tensor]):
         crowding.spread_scene[1, len(flow)](
             start.path, start.volume, start.material, start.gravity, start.share, flow,
             flow if budget is None else budget, spreads, frames - 1, count, *numbers, **options,
-            LIMITED=budget is not None, MASSES=self._masses, BLOCK=power(count), num_warps=warps(power(count)),
+            LIMITED=budget is not None, MASSES=self._masses, BLOCK=whole(count), num_warps=warps(whole(count)),
         )  # fmt: skip
         return spreads
 

@@ -29,6 +29,11 @@ def power(count: int) -> int:
     return 1 << max(0, count - 1).bit_length()
 
 
+def whole(count: int) -> int:
+    """The block of a program that takes so many particles or nodes, all there are."""
+    return max(power(count), 32)
+
+
 def warps(block: int) -> int:
     """Groups of 32 threads for a program over so many particles or nodes: up to 4 of them a thread, 8 where it must."""
     return min(max(block // 128, 4), 16)
