@@ -154,6 +154,8 @@ def test_configurations_of_trainings_are_valid(words, make_dataset, workplace, c
 @pytest.mark.parametrize("words", [w for w in lines() if w and w[0] == "python"], ids=" ".join)
 def test_scripts_and_their_options_exist(words):
     text = (ROOT / words[1]).read_text("utf-8")
+    if "make_timing_parser" in text:
+        text += (ROOT / "benchmarks/timing.py").read_text("utf-8")
     assert all(f'"{word}"' in text for word in words if word.startswith("--"))
     arguments = text.split("add_argument(")[1:]
     required = [re.findall(r'"(--[\w-]+)"', argument)[0] for argument in arguments if "required=True" in argument]
