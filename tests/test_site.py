@@ -83,7 +83,7 @@ def test_the_site_builds_and_fetches_nothing(tmp_path):
         assert FETCHED.search(page) is None, name
     assert all(f'id="nmpm.processors.{name}"' in pages["reference/nmpm.processors.html"] for name in ("UNet", "FNO"))
     commands = html.unescape(pages["reference/commands.html"])
-    assert all(option in commands for option in ("--shard I/N", "--full", "--private"))
+    assert all(option in commands for option in ("--shard I/N", "--full", "--private", "usage: nmpm zoo match"))
     concepts = pages["concepts.html"]
     assert concepts.count("<svg") > 10
     assert "```math" not in concepts

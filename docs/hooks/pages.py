@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[2]
 INCLUDED = ("[A-Z]*.md", "benchmarks/**/*.md", "zoo/**/*.md", "notebooks/*.ipynb")
 ASSETS = ("benchmarks/**/*.png", "benchmarks/**/*.html", "zoo/**/*.png")
 TRAINING = ("fit", "validate", "test", "predict")
-ZOO = ("list", "card", "add", "verify", "refresh", "push", "pull")
+ZOO = ("list", "card", "match", "add", "verify", "refresh", "push", "pull")
 TERMINAL = {"COLUMNS": "100", "NO_COLOR": "1"}
 
 ROOMS = (
@@ -108,6 +108,7 @@ def engines_page() -> str:
     engines = ("torch", *rules.FASTER)
     tried = "\n".join(f"| {name} | {where} |" for name, where in rules.TRIED.items())
     refusals = "\n".join(f"- {rule.feature}" for rule in rules.RECORDINGS)
+    errors = "\n".join(f"- {rule.feature}" for rule in rules.TRAINING_ERRORS)
     return (
         "# What runs where\n\n"
         "A call of a model is computed by an *engine*: torch's operations, which take everything, or kernels that are"
@@ -120,10 +121,14 @@ def engines_page() -> str:
         "## CUDA graphs\n\n"
         "On a CUDA GPU rollouts' calls are recorded when a shape of state comes again, and replayed from then on."
         f" Not recorded are shapes that change with each call, and:\n\n{refusals}\n\n"
-        f"## Runtimes\n\nWithout gradients alone.\n\n{_table(rules.RUNTIMES, ('openvino', 'windows'))}\n\n"
-        f"## Exported files\n\n{_table(rules.EXPORTS, ('step', 'network', 'solid'))}\n\n"
+        "## Runtimes\n\nThey compute the network of rollouts, without gradients. What is not marked is refused in one"
+        " line.\n\n"
+        f"{_table(rules.RUNTIMES, ('openvino', 'windows'))}\n\n"
+        "## Exported files\n\n`nmpm export` writes the *step* (a whole call), with `--processor` the *network* alone,"
+        " with `--solid` the cells of obstacles. What is not marked is refused in one line; all else is exported.\n\n"
+        f"{_table(rules.EXPORTS, ('step', 'network', 'solid'))}\n\n"
         "## Errors of trainings\n\n"
-        f"Kernels compute them but for:\n\n{chr(10).join(f'- {rule.feature}' for rule in rules.TRAINING_ERRORS)}\n\n"
+        f"Numba's kernels compute the losses of positions and densities too, but for:\n\n{errors}\n\n"
         f"## Where this has run\n\n| | on |\n|---|---|\n{tried}\n"
     )
 

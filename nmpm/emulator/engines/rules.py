@@ -181,7 +181,7 @@ RECORDINGS: tuple[Rule[Call], ...] = (
     Rule("graphs that torch.compile traces", (), lambda _: torch.compiler.is_compiling()),
     Rule("nmpm.transfer.without_kernels and scatter_backend", (), lambda _: not is_default()),
     Rule(
-        "a recording of something else",
+        "calls within a CUDA graph that the caller records",
         (),
         lambda _: _is_recording(),
     ),
