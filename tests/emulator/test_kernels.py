@@ -229,7 +229,7 @@ def test_the_number_of_threads_changes_nothing_to_the_bit(monkeypatch):
         monkeypatch.setattr(f"nmpm.emulator.engines.numba.{name}", 256)
     emulator = emulator_of(scene, cells=12, **HELD).requires_grad_(False)
     particles = cloud(scene, 3000, 2, statics=20)
-    engine, context = NumbaEngine(emulator, emulator.kernel_parameters), emulator.context(particles)
+    engine, context = NumbaEngine(emulator), emulator.context(particles)
     output = torch.randn(2, emulator.frames, 2, *emulator.grid.shape)
 
     def move():

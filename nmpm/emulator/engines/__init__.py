@@ -28,25 +28,25 @@ def find_engine(emulator: Emulator, particles: Particles, solid: Tensor) -> Engi
 def _numba(emulator: Emulator) -> Engine[Any, Any]:
     from nmpm.emulator.engines.numba.engine import NumbaEngine  # imported late, as Numba is
 
-    return NumbaEngine(emulator, emulator.kernel_parameters)
+    return NumbaEngine(emulator)
 
 
 def _numba_training(emulator: Emulator) -> Engine[Any, Any]:
     from nmpm.emulator.engines.numba.training import NumbaTraining
 
-    return NumbaTraining(emulator, emulator.kernel_parameters)
+    return NumbaTraining(emulator)
 
 
 def _triton(emulator: Emulator) -> Engine[Any, Any]:
     from nmpm.emulator.engines.triton.engine import TritonEngine  # Triton comes with torch's builds for CUDA
 
-    return TritonEngine(emulator, emulator.kernel_parameters)
+    return TritonEngine(emulator)
 
 
 def _triton_training(emulator: Emulator) -> Engine[Any, Any]:
     from nmpm.emulator.engines.triton.training import TritonTraining
 
-    return TritonTraining(emulator, emulator.kernel_parameters)
+    return TritonTraining(emulator)
 
 
 ENGINES: Mapping[str, Callable[[Emulator], Engine[Any, Any]]] = MappingProxyType(

@@ -25,6 +25,7 @@ from nmpm.emulator.bundle import Bundle, RolloutContext
 from nmpm.particles import Particles
 
 if TYPE_CHECKING:
+    from nmpm.emulator.engines.numba.parameters import KernelParameters
     from nmpm.emulator.model import Emulator
 
 Start = TypeVar("Start")
@@ -55,6 +56,11 @@ class Engine(ABC, Generic[Start, Values]):
     emulator: Emulator
 
     name: ClassVar[str]
+
+    @property
+    def parameters(self) -> KernelParameters:
+        """What kernels need of the emulator."""
+        return self.emulator.kernel_parameters
 
     def prepare(self, solid: Tensor, budget: Tensor | None) -> RolloutContext:
         """The context of a rollout; arguments as there."""
@@ -112,5 +118,9 @@ class Engine(ABC, Generic[Start, Values]):
 
 def _full_precision(device: str) -> AbstractContextManager[object]:
     """A context without autocast; entering one where none is on would cost as much as a small operation."""
-    on = torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
-    return torch.autocast(device, enabled=False) if on else nullcontext()
+    return torch.autocast(device, enabled=False) if is_autocast(device) else nullcontext()
+
+
+def is_autocast(device: str) -> bool:
+    """Whether autocast is on for a type of device."""
+    return torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)

@@ -10,24 +10,25 @@ import importlib.util
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
-from itertools import chain
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
-from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
+from nmpm.emulator.engines.engine import is_autocast
+from nmpm.emulator.engines.numba.parameters import DECODERS, NODES
 from nmpm.grid import Grid
 from nmpm.particles import Particles, scene_volumes
-from nmpm.transfer import Linear, Nearest, Quadratic
+from nmpm.transfer import Nearest, Quadratic
 from nmpm.transfer.execution import is_default, kernels_are_on
 
 if TYPE_CHECKING:
     from nmpm.emulator.model import Emulator
     from nmpm.emulator.recipe import EmulatorRecipe
 
-FASTER = ("numba", "numba training", "triton", "triton training")
+NUMBA, TRITON = ("numba", "numba training"), ("triton", "triton training")
+FASTER = (*NUMBA, *TRITON)
 """Engines beside "torch", by name; of those that take a call the first one computes it."""
 
 T = TypeVar("T")
@@ -43,133 +44,45 @@ class Rule(Generic[T]):
     mend: str = ""
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Predicted and true positions on a grid, for the errors of `nmpm.training.losses`."""
-
-    predicted: Tensor
-    target: Tensor
-    grid: Grid
-
-    @property
-    def is_on_cpu(self) -> bool:
-        return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in (self.predicted, self.target))
-
-
-@dataclass(frozen=True)
-class Call:
-    """A call of an emulator, among solids (B, C_solid, *S)."""
-
-    emulator: Emulator
-    particles: Particles
-    solid: Tensor
-
-    @property
-    def device(self) -> str:
-        return self.particles.position.device.type
-
-    @property
-    def motion(self) -> tuple[Tensor, Tensor]:
-        return self.particles.position, self.particles.velocity
-
-    @property
-    def surroundings(self) -> tuple[Tensor, ...]:
-        """Gravity, solids and numbers of the scenes."""
-        state = self.particles
-        numbers = (values for values in state.fields.values() if values.shape[1] == 1)
-        moving = () if state.obstacle_velocity is None else (state.obstacle_velocity,)
-        return (state.gravity, self.solid, *moving, *numbers)
-
-    @property
-    def is_float32(self) -> bool:
-        given = (*self.motion, self.particles.gravity)
-        return self.emulator.precision == torch.float32 and all(each.dtype == torch.float32 for each in given)
-
-    @property
-    def inputs(self) -> Iterator[Tensor]:
-        yield from (values for values in vars(self.particles).values() if isinstance(values, Tensor))
-        yield from self.particles.fields.values()
-        yield self.solid
-        yield from self.emulator.parameters()
-
-    @property
-    def sizes_differ(self) -> bool:
-        return scene_volumes(self.particles.volume, self.particles.mask) is None
-
-
-def _need_gradients(tensors: Iterable[Tensor]) -> bool:
-    return torch.is_grad_enabled() and any(values.requires_grad for values in tensors)
-
-
-def _is_recording() -> bool:
-    return torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()
-
-
-@cache
-def _has_triton() -> bool:
-    return importlib.util.find_spec("triton") is not None
-
-
-def _is_autocast(device: str) -> bool:
-    return torch.amp.is_autocast_available(device) and torch.is_autocast_enabled(device)
-
-
-_KNOWN_DECODERS = (Absolute, Residual, Flip, Blend, Acceleration)
-
+# Beside the kernels torch's strided 3-D convolutions in bfloat16 sometimes got weights' gradients of unset memory
+# (torch 2.13, CPU with AVX-512), which they do not beside tensor operations: no trainings in three dimensions.
+# Subclasses of transfers and decoders may do something else, so exactly these count.
 MODELS: tuple[Rule[EmulatorRecipe], ...] = (
-    Rule("one dimension", (), lambda recipe: recipe.scene.dim == 1),
-    # Beside the kernels torch's strided 3-D convolutions in bfloat16 sometimes got weights' gradients of unset memory
-    # (torch 2.13, CPU with AVX-512), which they do not beside tensor operations: no training.
-    Rule("three dimensions", ("numba",), lambda recipe: recipe.scene.dim == 3),
-    Rule("fields", ("numba", "numba training"), lambda recipe: bool(recipe.scene.fields)),
-    Rule("obstacles that move", ("numba", "numba training"), lambda recipe: recipe.scene.moving_obstacles),
-    Rule("rest beside open axes", (), lambda r: "open" in r.scene.boundary and r.constraints.rest_speed > 0),
-    # Subclasses may do something else, so exactly these count.
-    Rule(
-        "the transfers Nearest and Quadratic", ("numba",), lambda recipe: type(recipe.transfer) in (Nearest, Quadratic)
-    ),
-    Rule("other transfers", (), lambda recipe: type(recipe.transfer) not in (Nearest, Linear, Quadratic)),
-    Rule("another package's decoder", (), lambda recipe: type(recipe.decoder) not in _KNOWN_DECODERS),
-    Rule("bounds: reflect", ("numba",), lambda recipe: recipe.constraints.bounds == "reflect"),
-    Rule("bounds: error", (), lambda recipe: recipe.constraints.bounds == "error"),
-    Rule("a domain too far from the origin for float32", (), lambda recipe: not recipe.grid.resolves(torch.float32)),
+    Rule("one dimension", (), lambda model: model.scene.dim == 1),
+    Rule("three dimensions", ("numba",), lambda model: model.scene.dim == 3),
+    Rule("fields", NUMBA, lambda model: bool(model.scene.fields)),
+    Rule("obstacles that move", NUMBA, lambda model: model.scene.moving_obstacles),
+    Rule("rest beside open axes", (), lambda m: "open" in m.scene.boundary and m.constraints.rest_speed > 0),
+    Rule("the transfers Nearest and Quadratic", ("numba",), lambda model: type(model.transfer) in (Nearest, Quadratic)),
+    Rule("other transfers", (), lambda model: type(model.transfer) not in NODES),
+    Rule("another package's decoder", (), lambda model: type(model.decoder) not in DECODERS),
+    Rule("bounds: reflect", ("numba",), lambda model: model.constraints.bounds == "reflect"),
+    Rule("bounds: error", (), lambda model: model.constraints.bounds == "error"),
+    Rule("a domain too far from the origin for float32", (), lambda model: not model.grid.resolves(torch.float32)),
 )
 
 CALLS: tuple[Rule[Call], ...] = (
-    Rule("a CPU", ("numba", "numba training"), lambda call: call.device == "cpu"),
-    Rule("a CUDA GPU", ("triton", "triton training"), lambda call: call.device == "cuda"),
-    Rule("machines without Triton", ("numba", "numba training"), lambda _: not _has_triton()),
+    Rule("a CPU", NUMBA, lambda call: call.device == "cpu"),
+    Rule("a CUDA GPU", TRITON, lambda call: call.device == "cuda"),
+    Rule("machines without Triton", NUMBA, lambda _: not _has_triton()),
     Rule("other devices", (), lambda call: call.device not in ("cpu", "cuda")),
     Rule("rollouts", ("numba", "triton"), lambda call: not call.emulator.training),
     Rule("trainings", ("numba training", "triton training"), lambda call: call.emulator.training),
     Rule("float64", (), lambda call: not call.is_float32),
-    Rule(
-        "moving obstacles in the state", ("numba", "numba training"),
-        lambda call: call.particles.obstacle_velocity is not None,
-    ),
-    Rule(
-        "sizes of particles", ("numba", "numba training", "triton", "triton training"),
-        lambda call: call.particles.volume is not None,
-    ),
-    Rule("several sizes in a scene", ("numba", "triton", "triton training"), lambda call: call.sizes_differ),
+    Rule("moving obstacles in the state", NUMBA, lambda call: call.particles.obstacle_velocity is not None),
+    Rule("sizes of particles", FASTER, lambda call: call.particles.volume is not None),
+    Rule("several sizes in a scene", ("numba", *TRITON), lambda call: call.sizes_differ),
     Rule("gradients of gravity, obstacles or numbers of a scene", (), lambda call: _need_gradients(call.surroundings)),
+    Rule("gradients of a rollout", ("numba training", "triton training"), lambda call: _need_gradients(call.evolving)),
     Rule(
-        "gradients of a rollout", ("numba training", "triton training"),
-        lambda call: _need_gradients(
-            chain(call.motion, call.particles.fields.values(), call.emulator.parameters())
-        ),
-    ),
-    Rule(
-        "a recorded training step, which moves its grid", ("triton training",),
-        lambda call: type(call.emulator.grid) is not Grid,
+        "a recorded training step, which moves its grid",
+        ("triton training",),
+        lambda c: type(c.emulator.grid) is not Grid,
     ),
     Rule("graphs that torch.compile traces", (), lambda _: torch.compiler.is_compiling()),
     Rule("nmpm.transfer.without_kernels", (), lambda _: not kernels_are_on()),
-    Rule(
-        "deterministic algorithms", ("numba", "numba training"),
-        lambda _: torch.are_deterministic_algorithms_enabled(),
-    ),
-)  # fmt: skip
+    Rule("deterministic algorithms", NUMBA, lambda _: torch.are_deterministic_algorithms_enabled()),
+)
 
 RECORDINGS: tuple[Rule[Call], ...] = (
     Rule("devices other than a CUDA GPU", (), lambda call: call.device != "cuda"),
@@ -177,14 +90,10 @@ RECORDINGS: tuple[Rule[Call], ...] = (
     Rule("trainings (`--model.record true` records whole steps)", (), lambda call: call.emulator.training),
     Rule("bounds: error", (), lambda call: call.emulator.constraints.bounds == "error"),
     Rule("gradients", (), lambda call: _need_gradients(call.inputs)),
-    Rule("autocast", (), lambda call: _is_autocast(call.device)),
+    Rule("autocast", (), lambda call: is_autocast(call.device)),
     Rule("graphs that torch.compile traces", (), lambda _: torch.compiler.is_compiling()),
     Rule("nmpm.transfer.without_kernels and scatter_backend", (), lambda _: not is_default()),
-    Rule(
-        "calls within a CUDA graph that the caller records",
-        (),
-        lambda _: _is_recording(),
-    ),
+    Rule("calls within a CUDA graph that the caller records", (), lambda call: call.is_recorded),
 )
 """What calls that are recorded as CUDA graphs cannot have, whichever engine computes them."""
 
@@ -241,6 +150,65 @@ TRIED: Mapping[str, str] = MappingProxyType(
 """Where engines, recordings and runtimes have run."""
 
 
+@dataclass(frozen=True)
+class Call:
+    """A call of an emulator, among solids (B, C_solid, *S)."""
+
+    emulator: Emulator
+    particles: Particles
+    solid: Tensor
+
+    @property
+    def device(self) -> str:
+        return self.particles.position.device.type
+
+    @property
+    def surroundings(self) -> tuple[Tensor, ...]:
+        """Gravity, solids and numbers of the scenes."""
+        state = self.particles
+        numbers = (values for values in state.fields.values() if values.shape[1] == 1)
+        moving = () if state.obstacle_velocity is None else (state.obstacle_velocity,)
+        return (state.gravity, self.solid, *moving, *numbers)
+
+    @property
+    def is_float32(self) -> bool:
+        given = self.particles.position, self.particles.velocity, self.particles.gravity
+        return self.emulator.precision == torch.float32 and all(each.dtype == torch.float32 for each in given)
+
+    @property
+    def evolving(self) -> Iterator[Tensor]:
+        """Motion, fields and weights."""
+        yield from (self.particles.position, self.particles.velocity, *self.particles.fields.values())
+        yield from self.emulator.parameters()
+
+    @property
+    def inputs(self) -> Iterator[Tensor]:
+        yield from (values for values in vars(self.particles).values() if isinstance(values, Tensor))
+        yield self.solid
+        yield from self.evolving
+
+    @property
+    def is_recorded(self) -> bool:
+        return torch.cuda.is_available() and torch.cuda.is_current_stream_capturing()
+
+    @property
+    def sizes_differ(self) -> bool:
+        return scene_volumes(self.particles.volume, self.particles.mask) is None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Predicted and true positions on a grid, for the errors of `nmpm.training.losses`."""
+
+    predicted: Tensor
+    target: Tensor
+    grid: Grid
+
+    @property
+    def is_on_cpu(self) -> bool:
+        return all(x.device.type == "cpu" and x.dtype == torch.float32 for x in (self.predicted, self.target))
+
+
 def model_engines(recipe: EmulatorRecipe) -> tuple[str, ...]:
     """Those of `FASTER` that compute all that a model has."""
     return tuple(name for name in FASTER if takes(name, MODELS, recipe))
@@ -266,3 +234,12 @@ def call_engine(emulator: Emulator, particles: Particles, solid: Tensor) -> str:
     """The name of the engine that computes a call."""
     call = Call(emulator, particles, solid)
     return next((name for name in emulator.engines if takes(name, CALLS, call)), "torch")
+
+
+def _need_gradients(tensors: Iterable[Tensor]) -> bool:
+    return torch.is_grad_enabled() and any(values.requires_grad for values in tensors)
+
+
+@cache
+def _has_triton() -> bool:
+    return importlib.util.find_spec("triton") is not None

@@ -87,7 +87,7 @@ def _path_difference(cells: Tensor) -> str:
 def _training_difference(emulator: Emulator, particles: Particles, context: RolloutContext) -> str:
     from nmpm.emulator.engines.triton.training import TritonTraining
 
-    engines = TorchEngine(emulator), TritonTraining(emulator, emulator.kernel_parameters)
+    engines = TorchEngine(emulator), TritonTraining(emulator)
     velocities = engines[0].rasterise(particles, context).state[:, : emulator.scene.dim * len(emulator.scene.materials)]
     output = velocities.unsqueeze(1).repeat(1, emulator.frames, *(1,) * (velocities.dim() - 1))
     (path, gradients), (other, others) = (_differentiate(engine, particles, output, context) for engine in engines)
@@ -119,7 +119,7 @@ def _apart(emulator: Emulator, particles: Particles, context: RolloutContext) ->
 
     output = _SharedOutput(emulator.runtime)
     sharing = emulator.with_runtime(output)
-    engines = TorchEngine(sharing), TritonEngine(sharing, sharing.kernel_parameters)
+    engines = TorchEngine(sharing), TritonEngine(sharing)
     here, there = (engine.predict(particles, context).position for engine in engines)
     one, other = output.inputs
     cells = (here - there).norm(dim=-1).amax(1) / min(emulator.grid.spacing)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
-from threading import Lock
+from threading import RLock
 from typing import Generic, TypeVar
 
 from torch import Tensor, nn
@@ -72,7 +72,7 @@ class Programs(Generic[P]):
 
     def __init__(self) -> None:
         self._compiled: OrderedDict[tuple[int, Hashable], _Compiled[P]] = OrderedDict()
-        self._lock = Lock()
+        self._lock = RLock()
 
     def get(self, network: nn.Module, settings: Hashable) -> P | None:
         """The program of a module for settings; None if there is none of its present weights."""
@@ -86,12 +86,12 @@ class Programs(Generic[P]):
 
     def find(self, network: nn.Module, settings: Hashable, compile_program: Callable[[], P]) -> P:
         """The program of a module for settings, all else that it depends on; compiled if there is none."""
-        key = id(network), settings
         with self._lock:
-            compiled = self._compiled.get(key)
-            if compiled is None or not compiled.is_current():
-                compiled = self._compiled[key] = _Compiled(network, _weights(network), compile_program())
-            self._compiled.move_to_end(key)
-            while len(self._compiled) > MOST:
-                self._compiled.popitem(last=False)
-            return compiled.program
+            program = self.get(network, settings)
+            if program is None:
+                weights, program = _weights(network), compile_program()
+                self._compiled[id(network), settings] = _Compiled(network, weights, program)
+                self._compiled.move_to_end((id(network), settings))
+                while len(self._compiled) > MOST:
+                    self._compiled.popitem(last=False)
+            return program

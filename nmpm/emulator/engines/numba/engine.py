@@ -6,7 +6,6 @@ Only the network takes tensors: a dispatch of torch takes as long as a kernel do
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -21,7 +20,7 @@ from nmpm.emulator.engines.engine import Engine, Flight
 from nmpm.emulator.engines.numba.arrays import ArrayCache, as_array, as_grid, check_materials
 from nmpm.emulator.engines.numba.contact import keep_clear, keep_clear_of_moving
 from nmpm.emulator.engines.numba.crowding import spread_crowds
-from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
+from nmpm.emulator.engines.numba.parameters import Array
 from nmpm.emulator.engines.numba.path import CHUNK, fill_gains, find_path
 from nmpm.emulator.engines.numba.rest import bring_to_rest
 from nmpm.emulator.engines.numba.solids import SolidCache, prepare_solids
@@ -32,11 +31,9 @@ from nmpm.particles import Particles
 _STATISTICS = ("input_low", "input_high", "input_mean", "input_std")
 
 
-@dataclass(frozen=True)
 class NumbaEngine(Engine[StartArrays, Array]):
     """All steps as kernels, for rollouts without gradients on a CPU."""
 
-    parameters: KernelParameters
     name = "numba"
 
     def prepare(self, solid: Tensor, budget: Tensor | None) -> RolloutContext:

@@ -20,12 +20,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[Any]
 
-_NODES: Mapping[type[Transfer], tuple[int, int]] = MappingProxyType(
-    {Nearest: (1, 2), Linear: (2, 2), Quadratic: (3, 3)}
-)
-"""Nodes along an axis, of p2g and of g2p."""
+NODES: Mapping[type[Transfer], tuple[int, int]] = MappingProxyType({Nearest: (1, 2), Linear: (2, 2), Quadratic: (3, 3)})
+"""Transfers that kernels compute, by their nodes along an axis: of p2g and of g2p."""
 
-_DECODERS: Mapping[type[Decoder], Callable[[Any], tuple[float, ...]]] = MappingProxyType(
+DECODERS: Mapping[type[Decoder], Callable[[Any], tuple[float, ...]]] = MappingProxyType(
     {
         Absolute: lambda _: (0.0, 0.0, 0.0, 0.0),
         Residual: lambda _: (0.0, 1.0, 1.0, 0.0),
@@ -34,7 +32,7 @@ _DECODERS: Mapping[type[Decoder], Callable[[Any], tuple[float, ...]]] = MappingP
         Acceleration: lambda _: (0.0, 1.0, 1.0, 1.0),
     }
 )
-"""Decoders as numbers, see `KernelParameters`."""
+"""Decoders that kernels compute, as numbers, see `KernelParameters`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +96,7 @@ class KernelParameters:
 def kernel_parameters(recipe: EmulatorRecipe) -> KernelParameters:
     """The parameters of a recipe of which engines with kernels compute all, see `nmpm.emulator.engines.rules`."""
     scene, grid, constraints = recipe.scene, recipe.grid, recipe.constraints
-    (p2g, g2p), decoder = _NODES[type(recipe.transfer)], type(recipe.decoder)
+    (p2g, g2p), decoder = NODES[type(recipe.transfer)], type(recipe.decoder)
     spacing = np.array(grid.spacing)
     low, high = (np.array(scene.bounds).T - np.array(grid.lower)) / spacing
     low, high = np.where(scene.confined, low, -np.inf), np.where(scene.confined, high, np.inf)
@@ -120,7 +118,7 @@ def kernel_parameters(recipe: EmulatorRecipe) -> KernelParameters:
         first_field=len(dataclasses.replace(scene, evolving=(), properties=(), parameters=()).input_channels),
         solid=scene.walled,
         constants=scene.gravity_varies,
-        decoder=tuple(map(np.float32, _DECODERS[decoder](recipe.decoder))),
+        decoder=tuple(map(np.float32, DECODERS[decoder](recipe.decoder))),
         rest_speed=constraints.rest_speed,
         obstacles=scene.obstacles,
         solids=constraints.solids,

@@ -7,7 +7,6 @@ results do not depend on the number of threads. Second derivatives are an error.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,8 +23,8 @@ from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
 from nmpm.emulator.engines.numba.path import find_path
 from nmpm.emulator.engines.numba.scatter import scatter_adjoint
 from nmpm.emulator.engines.numba.state import ParticleArrays, StartArrays, output_array, rasterise, unpack
+from nmpm.emulator.engines.torch.advection import BundleStart
 from nmpm.emulator.engines.torch.engine import TorchEngine
-from nmpm.emulator.engines.torch.start import BundleStart
 from nmpm.emulator.rasterise import solid_velocity
 from nmpm.particles import Particles, scene_volumes
 from nmpm.transfer.transfer import LEAST_SHARE
@@ -33,11 +32,9 @@ from nmpm.transfer.transfer import LEAST_SHARE
 ZERO, ONE = np.float32(0), np.float32(1)
 
 
-@dataclass(frozen=True)
 class NumbaTraining(TorchEngine):
     """The torch engine with kernels for p2g and the path, both with gradients, for trainings on a CPU."""
 
-    parameters: KernelParameters
     name = "numba training"
 
     def grid_state(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

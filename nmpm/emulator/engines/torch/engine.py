@@ -10,8 +10,7 @@ from torch import Tensor
 from nmpm._support.collectives import normal_like
 from nmpm.emulator.bundle import Bundle, RolloutContext
 from nmpm.emulator.engines.engine import Engine, Flight
-from nmpm.emulator.engines.torch.advection import Advection
-from nmpm.emulator.engines.torch.start import BundleStart
+from nmpm.emulator.engines.torch.advection import Advection, BundleStart
 from nmpm.emulator.rasterise import grid_state
 from nmpm.particles import Particles
 

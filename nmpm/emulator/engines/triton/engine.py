@@ -12,10 +12,9 @@ from torch import Tensor
 from nmpm.emulator.bundle import Bundle, RolloutContext
 from nmpm.emulator.constraints import FREE_FALL_SHARE, mass_shares
 from nmpm.emulator.engines.engine import Engine, Flight
-from nmpm.emulator.engines.numba.parameters import KernelParameters
+from nmpm.emulator.engines.torch.advection import BundleStart
 from nmpm.emulator.engines.torch.contact import SURFACE
 from nmpm.emulator.engines.torch.crowding import CLOSED, MAX_SHIFT, SWEEPS
-from nmpm.emulator.engines.torch.start import BundleStart
 from nmpm.emulator.engines.torch.support import ENOUGH, MAX_DROP, REACH
 from nmpm.emulator.engines.triton import contact, crowding, grid, launch, motion, rest
 from nmpm.emulator.engines.triton.launch import axes, blocks, decoding, power, programs, walls, warps, whole
@@ -40,14 +39,12 @@ class TritonStart(BundleStart):
     path: Tensor
 
 
-@dataclass(frozen=True)
 class TritonEngine(Engine[TritonStart, Tensor]):
     """Kernels in Triton around the network, for rollouts on a CUDA GPU.
 
     Scenes of at most `launch.ONE_PROGRAM` particles take one launch for all frames, larger ones one for each.
     """
 
-    parameters: KernelParameters
     name = "triton"
 
     def rasterise(self, particles: Particles, context: RolloutContext) -> TritonStart:

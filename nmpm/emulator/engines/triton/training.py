@@ -7,7 +7,6 @@ an error. Where the grid and the bounds are is read on the device, so that steps
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -15,9 +14,8 @@ from torch import Tensor
 from torch.library import triton_op, wrap_triton
 
 from nmpm.emulator.bundle import RolloutContext
-from nmpm.emulator.engines.numba.parameters import KernelParameters
+from nmpm.emulator.engines.torch.advection import BundleStart
 from nmpm.emulator.engines.torch.engine import TorchEngine
-from nmpm.emulator.engines.torch.start import BundleStart
 from nmpm.emulator.engines.triton import launch
 from nmpm.emulator.engines.triton.adjoint import flight_back, rasterise_back
 from nmpm.emulator.engines.triton.grid import fill_state, scatter
@@ -26,11 +24,9 @@ from nmpm.emulator.engines.triton.motion import flight
 from nmpm.particles import Particles
 
 
-@dataclass(frozen=True)
 class TritonTraining(TorchEngine):
     """The torch engine with kernels for p2g and the path, both with gradients, for trainings on a CUDA GPU."""
 
-    parameters: KernelParameters
     name = "triton training"
 
     def grid_state(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
