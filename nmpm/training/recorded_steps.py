@@ -21,6 +21,7 @@ from torch.autograd.function import once_differentiable
 from nmpm._support.devices import copy_to
 from nmpm.emulator import Emulator
 from nmpm.emulator.engines import graphs
+from nmpm.emulator.engines.engine import is_autocast
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.particles import Particles, Window
@@ -69,7 +70,7 @@ class RecordedSteps:
         self, error: Error, emulator: Emulator, window: Window, inputs: Sequence[Tensor], settings: Hashable
     ) -> _RecordedStep | None:
         """The recorded step for inputs of these shapes; None where there is none and none can be recorded."""
-        precision = torch.get_autocast_dtype(emulator.device.type) if _is_autocast(emulator.device) else None
+        precision = torch.get_autocast_dtype(emulator.device.type) if is_autocast(emulator.device.type) else None
         shapes = tuple((values.shape, values.dtype) for values in inputs)
         key = settings, precision, _addresses(emulator), shapes
         if key not in self._steps and len(self._steps) < _MOST:
@@ -93,7 +94,7 @@ class _RecordedStep:
     """The recording of an error and its gradients, for copies of inputs."""
 
     def __init__(self, error: Error, emulator: Emulator, window: Window, inputs: Sequence[Tensor], pool: Any) -> None:
-        if _is_autocast(emulator.device) and torch.get_autocast_dtype(emulator.device.type) == torch.float16:
+        if is_autocast(emulator.device.type) and torch.get_autocast_dtype(emulator.device.type) == torch.float16:
             raise ConfigError("in float16 gradients need a scale that changes; use --trainer.precision bf16-mixed.")
         self._inputs = [values.clone(memory_format=torch.contiguous_format) for values in inputs]
         self._weights = [weight for weight in emulator.parameters() if weight.requires_grad]
@@ -176,10 +177,6 @@ def _addresses(emulator: Emulator) -> Hashable:
     """Where the weights are, which of them are trained, and where the statistics are."""
     weights = tuple((weight.data_ptr(), weight.requires_grad) for weight in emulator.parameters())
     return weights, tuple(buffer.data_ptr() for buffer in emulator.buffers()), emulator.training
-
-
-def _is_autocast(device: torch.device) -> bool:
-    return torch.amp.is_autocast_available(device.type) and torch.is_autocast_enabled(device.type)
 
 
 @contextmanager
