@@ -215,7 +215,7 @@ def test_kernels_that_fail_or_differ_are_left_to_torch_with_one_warning(change, 
         def predict(self, particles, context):
             return change(super().predict(particles, context))
 
-    made = SimpleNamespace(TritonEngine=lambda emulator, _: Kernels(emulator))
+    made = SimpleNamespace(TritonEngine=Kernels)
     monkeypatch.setitem(sys.modules, "nmpm.emulator.engines.triton.engine", made)
     on_gpu(monkeypatch)
     emulator, state = moving(box(), energy=True), state_of(box())
