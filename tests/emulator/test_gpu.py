@@ -247,7 +247,7 @@ def test_trainings_are_left_to_torch_where_gradients_differ(monkeypatch):
         def path(self, start, output, context):
             return WrongGradient.apply(super().path(start, output, context))
 
-    made = SimpleNamespace(TritonTraining=lambda emulator, _: Kernels(emulator))
+    made = SimpleNamespace(TritonTraining=Kernels)
     monkeypatch.setitem(sys.modules, "nmpm.emulator.engines.triton.training", made)
     on_gpu(monkeypatch)
     emulator, state = moving(box()).train().requires_grad_(), state_of(box())

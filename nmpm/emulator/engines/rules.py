@@ -44,6 +44,11 @@ class Rule(Generic[T]):
     mend: str = ""
 
 
+@cache
+def _has_triton() -> bool:
+    return importlib.util.find_spec("triton") is not None
+
+
 # Beside the kernels torch's strided 3-D convolutions in bfloat16 sometimes got weights' gradients of unset memory
 # (torch 2.13, CPU with AVX-512), which they do not beside tensor operations: no trainings in three dimensions.
 # Subclasses of transfers and decoders may do something else, so exactly these count.
@@ -238,8 +243,3 @@ def call_engine(emulator: Emulator, particles: Particles, solid: Tensor) -> str:
 
 def _need_gradients(tensors: Iterable[Tensor]) -> bool:
     return torch.is_grad_enabled() and any(values.requires_grad for values in tensors)
-
-
-@cache
-def _has_triton() -> bool:
-    return importlib.util.find_spec("triton") is not None
