@@ -64,8 +64,9 @@ def _table(trial: Trial, standings: Sequence[Standing]) -> Table:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
+    models = f"{trial.name}, {trial.scene.dim}-D models"
     table = Table(
-        title=f"{trial.name}: errors at {trial.frames} frames over that of the better trivial predictor",
+        title=f"{models}: errors at {trial.frames} frames over that of the better trivial predictor",
         title_justify="left",
         box=SIMPLE_HEAD,
         padding=0,

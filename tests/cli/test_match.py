@@ -283,7 +283,7 @@ def test_models_of_a_zoo_are_ranked_by_what_they_predict_of_data(capsys):
     data = write_foreign(24, every=2)
     assert main(["zoo", "match", str(data), "--root", "zoo"]) == 0
     said = capsys.readouterr().out
-    assert "grains: errors at 22 frames" in said
+    assert "grains, 2-D models: errors at 22 frames" in said
     for row in ("goop", "multimaterial", "nothing moves", "free fall"):
         assert row in said
     assert "waterdrop3d" not in said
