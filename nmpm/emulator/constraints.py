@@ -71,6 +71,19 @@ def check_within_bounds(path: Tensor, mask: Tensor, bounds: Tensor, confined: Se
     )
 
 
+def distance_beyond(position: Tensor, bounds: Sequence[tuple[float, float]], axes: Sequence[bool]) -> Tensor:
+    """(...) how far positions (..., D) are beyond bounds, of those axes where most: negative within, NaN of NaN.
+
+    Minus infinity without any axis.
+    """
+    sides = [
+        torch.maximum(low - column, column - high)
+        for column, (low, high), counts in zip(position.unbind(-1), bounds, axes, strict=True)
+        if counts
+    ]
+    return torch.stack(sides).amax(0) if sides else position.new_full(position.shape[:-1], -math.inf)
+
+
 @dataclass(frozen=True)
 class Constraints:
     """The constraints of an emulator's rollouts.

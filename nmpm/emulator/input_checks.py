@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from nmpm.emulator.constraints import distance_beyond
 from nmpm.emulator.model import Emulator
 from nmpm.errors import DataError
 from nmpm.particles import Particles
@@ -108,11 +109,7 @@ def warn_of_training_mode(emulator: Emulator) -> None:
 def warn_of_start_outside(emulator: Emulator, particles: Particles) -> None:
     """Warn of particles that start outside of the bounds by more than rounding: the first frame moves them in."""
     scene = emulator.scene
-    sides = [
-        torch.maximum(low - column, column - high) if walls else torch.zeros_like(column)
-        for column, (low, high), walls in zip(particles.position.unbind(-1), scene.bounds, scene.confined, strict=True)
-    ]
-    apart = torch.stack(sides).amax(0).masked_fill(~particles.mask, 0.0)
+    apart = distance_beyond(particles.position, scene.bounds, scene.confined).masked_fill(~particles.mask, 0.0)
     outside = apart > ROUNDING * min(emulator.grid.spacing)
     if outside.any():
         warnings.warn(
@@ -124,8 +121,4 @@ def warn_of_start_outside(emulator: Emulator, particles: Particles) -> None:
 
 def beyond_walls(scene: Scene, position: Tensor) -> Tensor:
     """Whether positions (..., D) are outside of the domain, (...) bool: never along periodic axes."""
-    sides = [
-        torch.zeros_like(column, dtype=torch.bool) if wraps else (column < low) | (column > high)
-        for column, (low, high), wraps in zip(position.unbind(-1), scene.domain, scene.periodic, strict=True)
-    ]
-    return torch.stack(sides).any(0)
+    return distance_beyond(position, scene.domain, [not wraps for wraps in scene.periodic]) > 0

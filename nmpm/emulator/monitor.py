@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from nmpm.emulator.bundle import Bundle
-from nmpm.emulator.constraints import MOST_GAIN, energy, lowest_potential, mass_shares
+from nmpm.emulator.constraints import MOST_GAIN, distance_beyond, energy, lowest_potential, mass_shares
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.rasterise import volume_fraction
 from nmpm.errors import NmpmError
@@ -151,11 +151,7 @@ class Monitor:
         grid, scene = emulator.grid, emulator.scene
         volume, cells = particles.present_volume, grid.to_cells(last.nan_to_num())
         fraction = volume_fraction(scene, grid, emulator.transfer, volume, cells)
-        sides = [
-            (column <= low) | (column >= high) if walls else torch.zeros_like(particles.mask)
-            for column, (low, high), walls in zip(last.unbind(-1), scene.bounds, scene.confined, strict=True)
-        ]
-        at_walls = torch.stack(sides).any(0) & particles.mask
+        at_walls = (distance_beyond(last, scene.bounds, scene.confined) >= 0) & particles.mask
         measures = {"crowding": fraction.flatten(1).amax(1).to(last), _AT_WALLS: at_walls.sum(1).to(last)}
         if self.crowding is None:
             first, count = scene.input_channels.index(f"{scene.materials[0]}.volume"), len(scene.materials)

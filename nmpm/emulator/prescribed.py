@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from nmpm.emulator.bundle import RolloutContext
+from nmpm.emulator.constraints import distance_beyond
 from nmpm.emulator.model import Emulator
 from nmpm.errors import DataError
 from nmpm.particles import Batched, Particles, Window
@@ -204,9 +205,8 @@ def without_escaped(scene: Scene, state: Particles) -> Particles:
     """The state without particles that are beyond the bounds of an open axis; they wait in the domain's middle."""
     if "open" not in scene.boundary:
         return state
-    columns = zip(state.position.unbind(-1), scene.bounds, scene.boundary, strict=True)
-    beyond = [(column < low) | (column > high) for column, (low, high), kind in columns if kind == "open"]
-    stays = state.mask & ~torch.stack(beyond).any(0)
+    open_axes = [kind == "open" for kind in scene.boundary]
+    stays = state.mask & ~(distance_beyond(state.position, scene.bounds, open_axes) > 0)
     middle = state.position.new_tensor(scene.domain).mean(1)
     moved = state.with_motion(
         torch.where(stays.unsqueeze(-1), state.position, middle), torch.where(stays.unsqueeze(-1), state.velocity, 0.0)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nmpm.emulator.engines.rules import TRAINING_ERRORS, Comparison, takes
+from nmpm.emulator.engines.rules import TRAINING_ERRORS, PositionPair, takes
 from nmpm.emulator.prescribed import predicted_particles
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
@@ -152,7 +152,7 @@ def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) 
 def position_errors(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid, frames: int) -> Tensor:
     """`position_error` of each of B windows and of each bundle of `frames` frames, (B, T / frames)."""
     check_comparable(predicted, target, frames)  # (kernels check no bounds)
-    if takes("numba", TRAINING_ERRORS, Comparison(predicted, target, grid)):
+    if takes("numba", TRAINING_ERRORS, PositionPair(predicted, target, grid)):
         from nmpm.training.kernels import PositionErrors
 
         errors: Tensor = PositionErrors.apply(predicted, target, mask, grid, frames)  # type: ignore[no-untyped-call]
@@ -198,7 +198,7 @@ def density_error(
     """
     fraction = scene.particle_volume / grid.cell_volume
     cells = (grid.to_cells(frames, frames.dtype) for frames in (predicted, target))
-    kernels = there is None and takes("numba", TRAINING_ERRORS, Comparison(predicted, target, grid))
+    kernels = there is None and takes("numba", TRAINING_ERRORS, PositionPair(predicted, target, grid))
     if kernels and (sizes := scene_volumes(window.volume, window.mask)) is not None:
         scale = fraction * sizes.view(-1, 1, 1, 1)
         predicted_fraction, true_fraction = (scale * _kernel_counts(of, window, scene, grid) for of in cells)

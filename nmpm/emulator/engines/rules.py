@@ -131,7 +131,7 @@ EXPORTS: tuple[Rule[Emulator], ...] = (
 )  # fmt: skip
 """What exported files of a call ("step"), the network alone and the obstacles' cells ("solid") carry."""
 
-TRAINING_ERRORS: tuple[Rule[Comparison], ...] = (
+TRAINING_ERRORS: tuple[Rule[PositionPair], ...] = (
     Rule("one and three dimensions", (), lambda pair: pair.grid.dim != 2),
     Rule("other devices than a CPU, and float64", (), lambda pair: not pair.is_on_cpu),
     Rule("gradients of the true positions", (), lambda pair: pair.target.requires_grad),
@@ -202,7 +202,7 @@ class Call:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PositionPair:
     """Predicted and true positions on a grid, for the errors of `nmpm.training.losses`."""
 
     predicted: Tensor

@@ -67,12 +67,12 @@ def _difference(emulator: Emulator, particles: Particles, solid: Tensor) -> str:
 
 def _rollout_difference(emulator: Emulator, particles: Particles, context: RolloutContext) -> str:
     inputs, free = _apart(emulator.unconstrained(), particles, context)
-    _, held = _apart(emulator, particles, context)
+    _, constrained = _apart(emulator, particles, context)
     if not inputs <= TOLERANCE:
         return f"the network's inputs differ by {inputs:.2g} standard deviations on average"
     if difference := _path_difference(free):
         return difference
-    if (share := float((~(held <= TOLERANCE)).float().mean())) > _SHARE:
+    if (share := float((~(constrained <= TOLERANCE)).float().mean())) > _SHARE:
         return f"with constraints {share:.0%} of the particles differ by more than {TOLERANCE} cells after one bundle"
     return ""
 

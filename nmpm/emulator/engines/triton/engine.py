@@ -156,15 +156,10 @@ class TritonEngine(Engine[TritonStart, Tensor]):
         """`_move` within an energy, for scenes of any size; (B, m tiles) squares of the longest steps."""
         model, (batch, frames, count, _) = self.emulator, start.path[:, 1:].shape
         tiles = blocks(count)
-        sums, squares = (
-            start.path.new_empty(batch, frames, tiles, motion.SUMS.value),
-            start.path.new_empty(batch, frames * tiles),
-        )
-        weight, carried, (numbers, options) = (
-            self._weight(start),
-            torch.empty_like(start.velocity),
-            self._moving(output),
-        )
+        sums = start.path.new_empty(batch, frames, tiles, motion.SUMS.value)
+        squares = start.path.new_empty(batch, frames * tiles)
+        weight, carried = self._weight(start), torch.empty_like(start.velocity)
+        numbers, options = self._moving(output)
         for frame in range(frames + 1):
             motion.advance[tiles, batch](
                 start.velocity, start.material, weight, start.gravity, start.state, output, model.output_scale, budget,
@@ -244,11 +239,8 @@ class TritonEngine(Engine[TritonStart, Tensor]):
 
     def _spread(self, start: TritonStart, flow: Tensor, budget: Tensor | None) -> Tensor:
         """(B, m + 1, N, 2) the path that spreads its overfull cells; its first frame is not filled."""
-        spreads, (_, frames, count, _), (numbers, options) = (
-            torch.empty_like(start.path),
-            start.path.shape,
-            self._spreading,
-        )
+        spreads, (_, frames, count, _) = torch.empty_like(start.path), start.path.shape
+        numbers, options = self._spreading
         crowding.spread_scene[1, len(flow)](
             start.path, start.volume, start.material, start.gravity, start.share, flow,
             flow if budget is None else budget, spreads, frames - 1, count, *numbers, **options,
