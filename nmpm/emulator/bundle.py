@@ -12,8 +12,7 @@ from torch import Tensor
 from nmpm.particles import Particles
 
 if TYPE_CHECKING:
-    from nmpm.emulator.engines.numba.arrays import ArrayCache
-    from nmpm.emulator.engines.numba.solids import SolidCache
+    from nmpm.emulator.engines.numba.engine import PreparedArrays
 
 
 @dataclass(frozen=True)
@@ -50,19 +49,15 @@ class RolloutContext:
     Args:
         solid: (B, C_solid, *S) share of each cell that is wall or obstacle; C_solid is 0 or 1.
         budget: (B,) energy per mass that no frame may exceed, in grid units; None where energy is not constrained.
-        solid_caches: What kernels have prepared of each scene's solids; None to prepare it in each call.
-        array_cache: Tensors that kernels have converted to arrays; None to convert them in each call.
+        prepared: What the numba engine has prepared; None to prepare it in each call.
     """
 
     solid: Tensor
     budget: Tensor | None
-    solid_caches: tuple[SolidCache, ...] | None = None
-    array_cache: ArrayCache | None = None
+    prepared: PreparedArrays | None = None
 
     def scenes(self, chosen: list[int]) -> RolloutContext:
         """The context of part of the batch."""
         budget = None if self.budget is None else self.budget[chosen]
-        if self.solid_caches is None or self.array_cache is None:
-            return RolloutContext(self.solid[chosen], budget)
-        caches = tuple(self.solid_caches[scene] for scene in chosen)
-        return RolloutContext(self.solid[chosen], budget, caches, type(self.array_cache)())
+        prepared = None if self.prepared is None else self.prepared.scenes(chosen)
+        return RolloutContext(self.solid[chosen], budget, prepared)

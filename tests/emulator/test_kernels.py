@@ -274,7 +274,7 @@ def test_a_rollouts_context_follows_what_changes(change):
         particles = dataclasses.replace(particles, gravity=-particles.gravity)
     else:
         particles.mask[:, 40:] = False
-    unprepared = dataclasses.replace(context, array_cache=None)
+    unprepared = dataclasses.replace(context, prepared=None)
     assert not torch.equal(emulator(particles, context).position, before)
     assert torch.equal(emulator(particles, context).position, emulator(particles, unprepared).position)
 

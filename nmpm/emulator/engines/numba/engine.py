@@ -6,6 +6,7 @@ Only the network takes tensors: a dispatch of torch takes as long as a kernel do
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -31,13 +32,25 @@ from nmpm.particles import Particles
 _STATISTICS = ("input_low", "input_high", "input_mean", "input_std")
 
 
+@dataclass(frozen=True)
+class PreparedArrays:
+    """What the calls of a rollout share: the solids of each scene, and arrays of tensors."""
+
+    solids: tuple[SolidCache, ...]
+    arrays: ArrayCache = field(default_factory=ArrayCache)
+
+    def scenes(self, chosen: list[int]) -> PreparedArrays:
+        """The same for part of the batch."""
+        return PreparedArrays(tuple(self.solids[scene] for scene in chosen))
+
+
 class NumbaEngine(Engine[StartArrays, Array]):
     """All steps as kernels, for rollouts without gradients on a CPU."""
 
     name = "numba"
 
     def prepare(self, solid: Tensor, budget: Tensor | None) -> RolloutContext:
-        return RolloutContext(solid, budget, self._prepare(solid), ArrayCache())
+        return RolloutContext(solid, budget, PreparedArrays(self._prepare(solid)))
 
     def rasterise(self, particles: Particles, context: RolloutContext) -> StartArrays:
         cached, scales, scene = _cache(context).array, self.emulator.field_scales, self.emulator.scene
@@ -117,14 +130,14 @@ class NumbaEngine(Engine[StartArrays, Array]):
         return _cache(context).array(name, getattr(self.emulator, name)).reshape(-1)
 
     def _solids(self, context: RolloutContext) -> tuple[SolidCache, ...]:
-        return context.solid_caches or self._prepare(context.solid)
+        return self._prepare(context.solid) if context.prepared is None else context.prepared.solids
 
     def _prepare(self, solid: Tensor) -> tuple[SolidCache, ...]:
         return prepare_solids(self.parameters, solid, self.emulator.walls)
 
 
 def _cache(context: RolloutContext) -> ArrayCache:
-    return context.array_cache or ArrayCache()
+    return ArrayCache() if context.prepared is None else context.prepared.arrays
 
 
 def _budget(context: RolloutContext, scene: int) -> float | None:
