@@ -32,7 +32,7 @@ from nmpm.data.loading.recording import Recording, SplitRecordings
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Particles
-from nmpm.scene import Scene
+from nmpm.scene import Reading, Scene
 
 CHECKS = 24
 """Validation losses per training, beside those of the written simulators."""
@@ -239,7 +239,7 @@ def main() -> None:
 
 
 def _recordings(folder: Path, scene: Scene, split: str) -> list[Recording]:
-    recordings = SplitRecordings(Split(folder / f"{split}.h5"), read_metadata(folder), scene)
+    recordings = SplitRecordings(Split(folder / f"{split}.h5"), read_metadata(folder), Reading(scene))
     return [recordings[index] for index in range(len(recordings))]
 
 

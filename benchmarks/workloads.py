@@ -33,7 +33,7 @@ from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.constraints import Constraints
 from nmpm.particles import Particles, Window
 from nmpm.processors import UNet
-from nmpm.scene import Scene
+from nmpm.scene import Reading, Scene
 from nmpm.sim import Preset, load_preset
 from nmpm.training.losses import position_error
 from nmpm.transfer import Linear, Nearest, Transfer, without_kernels
@@ -189,10 +189,11 @@ class TrainingStep:
 
 def simulate_windows(preset: Preset, seed: int, scenes: int, workers: int) -> Iterator[Window]:
     """Whole trajectories of a preset, one scene each."""
-    reader = RecordingReader(preset_metadata(preset), preset.scene)
+    reading = Reading(preset.scene)
+    reader = RecordingReader(preset_metadata(preset), reading)
     seeds = [derive_seed(seed, index) for index in range(scenes)]
     with ThreadPoolExecutor(workers) as pool, progress_bar(f"{preset.name} box", scenes) as advance:
         for made in pool.map(preset.simulate, seeds):
             recording = reader.recording(Trajectory(made.position, made.particle_type), preset.name)
-            yield collate([recording], preset.scene)
+            yield collate([recording], reading)
             advance()

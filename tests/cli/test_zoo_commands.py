@@ -42,7 +42,7 @@ def test_a_card_is_a_page_to_read_or_yaml_for_programs(home, capsys):
     page = capsys.readouterr().out
     assert page.startswith("# goop\n")
     assert "| nothing moves |" in page
-    assert len(page.splitlines()) < 70
+    assert len(page.splitlines()) < 75  # two screens
     assert main(["zoo", "card", "goop", "--yaml"]) == 0
     assert yaml.safe_load(capsys.readouterr().out) == Zoo.card("goop")
     (home / "zoo" / "bare").mkdir(parents=True)

@@ -207,8 +207,9 @@ class Gather(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients with respect to fields and cells."""
         parameters: KernelParameters = ctx.parameters
-        rows, here, pull = as_array(ctx.saved_tensors[0]), as_array(ctx.saved_tensors[1]), as_array(grad)
-        kinds, real = material_rows(ctx.saved_tensors[2], parameters.materials), np.ones(here.shape[2], np.bool_)
+        fields, cells, material = ctx.saved_tensors  # once: a checkpoint unpacks each tensor once
+        rows, here, pull = as_array(fields), as_array(cells), as_array(grad)
+        kinds, real = material_rows(material, parameters.materials), np.ones(here.shape[2], np.bool_)
         grad_rows, grad_cells, values = np.zeros_like(rows), np.zeros_like(here), (0,) * pull.shape[3]
 
         def follow(b: int) -> None:
