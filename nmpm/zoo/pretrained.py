@@ -21,14 +21,7 @@ from nmpm._support.devices import find_device
 from nmpm._support.numbers import check_whole
 from nmpm.data.format import Trajectory
 from nmpm.data.initial_states import thrown_blocks
-from nmpm.emulator import (
-    NETWORK_PRECISIONS,
-    Emulator,
-    Prescribed,
-    Rollout,
-    differentiable_rollout,
-    predict_rollout,
-)
+from nmpm.emulator import NETWORK_PRECISIONS, Emulator, Prescribed, Rollout, differentiable_rollout, predict_rollout
 from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.emulator.input_checks import warn_of_start_outside
 from nmpm.emulator.runtimes import Runtime
