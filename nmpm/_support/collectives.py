@@ -172,7 +172,7 @@ class RankWatch:
 
 
 def _dismiss_observer() -> None:
-    """Let Lightning's thread, which kills rank 0 without a word within 5 seconds of another's end, watch nobody."""
+    """Take all ranks from Lightning's observer thread, which would kill rank 0 without a message once another ends."""
     for thread in threading.enumerate():
         if thread.name == "child-process-observer":
             thread._child_processes = []  # type: ignore[attr-defined]

@@ -31,9 +31,7 @@ def grid_state(
     momentum, count = transfer.momentum(velocity, membership, cells, grid)
     mean = momentum / divisors(count).repeat_interleave(scene.dim, dim=1)
     volume = count * (scene.particle_volume / grid.cell_volume)
-    parts = [mean, volume, solid]
-    if scene.moving_obstacles:
-        parts.append(solid_velocity(grid, transfer, particles, cells.dtype))
+    parts = [mean, volume, solid_channels(scene, grid, transfer, particles, solid, cells.dtype)]
     if scene.gravity_varies:
         parts.append(_constant(grid.to_cell_displacement(particles.gravity, cells.dtype), grid))
     if scales is not None and scene.particle_fields:
@@ -63,7 +61,16 @@ def solid_fraction(scene: Scene, grid: Grid, transfer: Transfer, particles: Part
     return (walls + volume_fraction(scene, grid, transfer, volume, cells)).clamp(max=1.0)
 
 
-def solid_velocity(grid: Grid, transfer: Transfer, particles: Particles, dtype: torch.dtype) -> Tensor:
+def solid_channels(
+    scene: Scene, grid: Grid, transfer: Transfer, particles: Particles, solid: Tensor, dtype: torch.dtype
+) -> Tensor:
+    """The grid state's channels of solids (B, C, *S): `solid`, and where obstacles move their mean velocity."""
+    if not scene.moving_obstacles:
+        return solid
+    return torch.cat([solid, _solid_velocity(grid, transfer, particles, dtype)], dim=1)
+
+
+def _solid_velocity(grid: Grid, transfer: Transfer, particles: Particles, dtype: torch.dtype) -> Tensor:
     """The mean velocity of the obstacles in each cell, by volume, (B, D, *S) in cells per frame; 0 where none is."""
     cells, volume = grid.to_cells(particles.obstacle, dtype), _obstacle_volumes(particles, dtype).unsqueeze(-1)
     if particles.obstacle_velocity is None:

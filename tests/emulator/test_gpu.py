@@ -124,7 +124,11 @@ def gradients_of(engine, emulator, state):
     return path.detach(), torch.autograd.grad(loss, [*motion, *emulator.parameters()])
 
 
-def assert_same_gradients(gradients, others):
+def check_training(emulator, reference, state):
+    """Values and gradients by kernels are those of tensor operations, of an emulator with the same weights."""
+    path, gradients = gradients_of(ENGINES["triton training"](emulator), emulator, state)
+    expected, others = gradients_of(TorchEngine(reference), reference, state)
+    torch.testing.assert_close(path, expected, rtol=0, atol=1e-5)
     for gradient, other in zip(gradients, others, strict=True):
         # Where a node has almost no particle, gradients of its mean velocity are large differences, in either form.
         assert (gradient - other).norm() <= 5e-3 * other.norm() + 1e-9
@@ -138,10 +142,7 @@ def test_trainings_have_the_values_and_gradients_of_tensor_operations(name, devi
     state = state_of(scene, **motion).to(device)
     if scene.obstacles:
         state = dataclasses.replace(state, volume=torch.linspace(0.5, 2.0, 40, device=device).expand(2, -1))
-    path, gradients = gradients_of(ENGINES["triton training"](emulator), emulator, state)
-    expected, others = gradients_of(TorchEngine(emulator), emulator, state)
-    torch.testing.assert_close(path, expected, rtol=0, atol=1e-5)
-    assert_same_gradients(gradients, others)
+    check_training(emulator, emulator, state)
 
 
 @pytest.mark.usefixtures("triton")
@@ -162,10 +163,7 @@ def test_the_grid_may_move_where_steps_are_recorded(device):
     window = window_of(state, state.position.unsqueeze(1).expand(-1, 3, -1, -1))
     inputs = recorded_steps._inputs(emulator, moved, state, window)
     _, _, placed = recorded_steps._arguments(emulator, window, inputs)
-    path, gradients = gradients_of(ENGINES["triton training"](placed), placed, state)
-    expected, others = gradients_of(TorchEngine(moved), moved, state)
-    torch.testing.assert_close(path, expected, rtol=0, atol=1e-5)
-    assert_same_gradients(gradients, others)
+    check_training(placed, moved, state)
 
 
 @pytest.mark.usefixtures("triton")

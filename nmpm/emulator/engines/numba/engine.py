@@ -26,7 +26,7 @@ from nmpm.emulator.engines.numba.path import CHUNK, fill_gains, find_path
 from nmpm.emulator.engines.numba.rest import bring_to_rest
 from nmpm.emulator.engines.numba.solids import SolidCache, prepare_solids
 from nmpm.emulator.engines.numba.state import ParticleArrays, StartArrays, normalise, output_array, rasterise, unpack
-from nmpm.emulator.rasterise import solid_velocity
+from nmpm.emulator.rasterise import solid_channels
 from nmpm.particles import Particles
 
 _STATISTICS = ("input_low", "input_high", "input_mean", "input_std")
@@ -55,10 +55,8 @@ class NumbaEngine(Engine[StartArrays, Array]):
     def rasterise(self, particles: Particles, context: RolloutContext) -> StartArrays:
         cached, scales, scene = _cache(context).array, self.emulator.field_scales, self.emulator.scene
         batch, count = particles.mask.shape
-        nothing, solid = np.empty((batch, count, 0), np.float32), cached("solid", context.solid)
-        if scene.moving_obstacles:
-            moved = solid_velocity(self.emulator.grid, self.emulator.transfer, particles, torch.float32)
-            solid = np.concatenate((solid, as_array(moved)), axis=1)
+        grid, transfer, nothing = self.emulator.grid, self.emulator.transfer, np.empty((batch, count, 0), np.float32)
+        solid = solid_channels(scene, grid, transfer, particles, context.solid, torch.float32)
         arrays = ParticleArrays(
             as_array(particles.position), as_array(particles.velocity), cached("gravity", particles.gravity),
             cached("mask", particles.mask),
@@ -66,7 +64,7 @@ class NumbaEngine(Engine[StartArrays, Array]):
             np.empty((batch, 0), np.float32) if particles.volume is None else as_array(particles.volume.float()),
             as_array(scales.of_particles(particles)) if scene.particle_fields else nothing,
             as_array(scales.of_scene(particles)) if scene.parameters else np.empty((batch, 0), np.float32),
-            solid,
+            cached("solid", solid),
         )  # fmt: skip
         start, solids = rasterise(self.parameters, arrays, self.emulator.frames), self.solids_ahead(particles)
         ahead = () if solids is None else [self._prepare(there.unsqueeze(1)) for there in solids.unbind(1)]

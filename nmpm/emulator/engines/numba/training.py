@@ -25,7 +25,7 @@ from nmpm.emulator.engines.numba.scatter import scatter_adjoint
 from nmpm.emulator.engines.numba.state import ParticleArrays, StartArrays, output_array, rasterise, unpack
 from nmpm.emulator.engines.torch.advection import BundleStart
 from nmpm.emulator.engines.torch.engine import TorchEngine
-from nmpm.emulator.rasterise import solid_velocity
+from nmpm.emulator.rasterise import solid_channels
 from nmpm.particles import Particles, scene_volumes
 from nmpm.transfer.transfer import LEAST_SHARE
 
@@ -39,9 +39,7 @@ class NumbaTraining(TorchEngine):
 
     def grid_state(self, particles: Particles, solid: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         model, scales = self.emulator, self.emulator.field_scales
-        if model.scene.moving_obstacles:
-            moved = solid_velocity(model.grid, model.transfer, particles, torch.float32)
-            solid = torch.cat([solid, moved], dim=1)
+        solid = solid_channels(model.scene, model.grid, model.transfer, particles, solid, torch.float32)
         cells, velocity, gravity, state = Rasterise.apply(  # type: ignore[no-untyped-call]
             self.parameters, particles.position, particles.velocity, scales.of_particles(particles), particles.gravity,
             particles.material, particles.mask, scales.of_scene(particles), solid,
