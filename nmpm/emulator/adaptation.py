@@ -8,6 +8,7 @@ dropped, the adapted emulator predicts what the original does.
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Sequence
 
 import torch
@@ -16,7 +17,7 @@ from torch import Tensor
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.recipe import EmulatorRecipe
 from nmpm.errors import ConfigError
-from nmpm.processors import GridLayout
+from nmpm.processors import GridLayout, Stochastic
 from nmpm.processors.channels import ChannelChange, OutputSource
 from nmpm.scene import Scene
 
@@ -38,7 +39,9 @@ def adapted(emulator: Emulator, recipe: EmulatorRecipe) -> Emulator:
         ConfigError: if the processor, the number of frames or of axes differ, or channels do and the processor does not
             say which of its layers depend on them.
     """
-    old, scene = emulator.scene, recipe.scene
+    old, scene, processor = emulator.scene, recipe.scene, recipe.processor
+    if isinstance(processor, Stochastic) and processor.processor == emulator.recipe.processor:
+        emulator = with_noise(emulator, processor)
     for name, before, after in (
         ("processor", emulator.recipe.processor, recipe.processor),
         ("frames", emulator.frames, recipe.frames),
@@ -46,17 +49,47 @@ def adapted(emulator: Emulator, recipe: EmulatorRecipe) -> Emulator:
     ):
         if before != after:
             raise ConfigError(f"The emulator's weights are for {name} = {before}, not {after}.")
-    with torch.random.fork_rng(devices=[]):  # the weights drawn here are replaced
-        other = recipe.build().to(emulator.device)
-    if other.network_precision != emulator.network_precision:
-        other.processor.to(emulator.network_precision)
+    other = _built_like(emulator, recipe)
     if _channels(old) == _channels(scene):
         other.load_state_dict(emulator.state_dict())
     else:
         other.load_state_dict(other.state_dict() | _statistics(emulator, other) | _weights(emulator, other))
+    return _with_mode_of(emulator, other)
+
+
+@torch.no_grad()
+def with_noise(emulator: Emulator, processor: Stochastic | None = None) -> Emulator:
+    """A copy of an emulator whose network also reads noise, which changes nothing before a training.
+
+    Raises ConfigError if the network does not say which of its layers depend on channels.
+    """
+    processor = Stochastic(emulator.recipe.processor) if processor is None else processor
+    if (layers := emulator.processor.channel_layers) is None:
+        kind = type(emulator.recipe.processor).__name__
+        raise ConfigError(f"{kind} names no channel_layers, so that noise cannot be added to trained weights.")
+    other = _built_like(emulator, dataclasses.replace(emulator.recipe, processor=processor))
+    state, prefix = emulator.state_dict(), "processor."
+    before = {name.removeprefix(prefix): values for name, values in state.items() if name.startswith(prefix)}
+    weights = processor.weights(before, layers, len(emulator.scene.input_channels))
+    kept = {name: values for name, values in state.items() if not name.startswith(prefix)}
+    other.load_state_dict(kept | {f"{prefix}{name}": values for name, values in weights.items()})
+    return _with_mode_of(emulator, other)
+
+
+def _built_like(emulator: Emulator, recipe: EmulatorRecipe) -> Emulator:
+    """An emulator of a recipe, with the device and precision of another."""
+    with torch.random.fork_rng(devices=[]):  # the weights drawn here are replaced
+        other = recipe.build().to(emulator.device)
+    if other.network_precision != emulator.network_precision:
+        other.processor.to(emulator.network_precision)
+    return other
+
+
+def _with_mode_of(emulator: Emulator, other: Emulator) -> Emulator:
+    """The other emulator with the runtime and mode of the first, and its frozen weights frozen."""
     frozen = {name for name, weight in emulator.named_parameters() if not weight.requires_grad}
     for name, weight in other.named_parameters():
-        weight.requires_grad_(name not in frozen)
+        weight.requires_grad_(name not in frozen and name.replace("processor.network.", "processor.") not in frozen)
     other.runtime = copy.deepcopy(emulator.runtime)
     return other.train(emulator.training)
 

@@ -50,11 +50,13 @@ class RolloutContext:
         solid: (B, C_solid, *S) share of each cell that is wall or obstacle; C_solid is 0 or 1.
         budget: (B,) energy per mass that no frame may exceed, in grid units; None where energy is not constrained.
         prepared: What the numba engine has prepared; None to prepare it in each call.
+        noise: (B, Z, *S) what a stochastic processor reads in the next call; None for zeros.
     """
 
     solid: Tensor
     budget: Tensor | None
     prepared: PreparedArrays | None = None
+    noise: Tensor | None = None
 
     def scenes(self, chosen: list[int]) -> RolloutContext:
         """The context of part of the batch."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -14,6 +15,7 @@ from nmpm.emulator.bundle import Bundle, RolloutContext
 from nmpm.emulator.input_checks import check_inputs, warn_of_training_mode
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor
+from nmpm.emulator.noise import Noise
 from nmpm.emulator.periods import Periods
 from nmpm.emulator.prescribed import Exchange, Prescribed
 from nmpm.particles import Particles
@@ -29,6 +31,7 @@ def unroll(
     monitor: Monitor | None = None,
     frames: int | None = None,
     prescribed: Prescribed | None = None,
+    noise: Noise | None = None,
 ) -> Iterator[Bundle]:
     """Predict bundle after bundle, each from the last, keeping gradients where they are enabled.
 
@@ -46,7 +49,7 @@ def unroll(
             monitor.ignore_energy()
     periods = Periods(emulator)
     particles = periods.wrap(particles)
-    calls = _Calls(emulator, particles, exchange)
+    calls = _Calls(emulator, particles, exchange, noise)
     for index in range(bundles):
         bundle = calls.predict(particles)
         travelled = periods.unwrapped(bundle)
@@ -67,21 +70,25 @@ def unroll(
 class _Calls:
     """The calls of a rollout, of the scenes that are not at rest."""
 
-    def __init__(self, emulator: Emulator, particles: Particles, exchange: Exchange) -> None:
-        self._emulator, self._count, self._exchange = emulator, len(particles.position), exchange
+    def __init__(self, emulator: Emulator, particles: Particles, exchange: Exchange, noise: Noise | None) -> None:
+        self._emulator, self._count, self._exchange, self._noise = emulator, len(particles.position), exchange, noise
         self._context = self._moving_context = exchange.first_context(particles)
         self._moving, self._last = list(range(self._count)), Bundle(particles.position, particles.velocity)
 
     def predict(self, particles: Particles) -> Bundle:
         """The next bundle of all scenes."""
         if len(self._moving) == self._count:
-            self._last = self._emulator(particles, self._moving_context)
+            self._last = self._emulator(particles, self._call_context())
         elif self._moving:
-            moving = self._emulator(particles.scenes(self._moving), self._moving_context)
+            moving = self._emulator(particles.scenes(self._moving), self._call_context())
             fields = {name: self._put(values, moving.fields[name]) for name, values in self._last.fields.items()}
             position = self._put(self._last.position, moving.position)
             self._last = Bundle(position, self._put(self._last.velocity, moving.velocity), fields)
         return self._last
+
+    def _call_context(self) -> RolloutContext:
+        context = self._moving_context
+        return context if self._noise is None else self._noise.in_context(context, self._moving)
 
     def _put(self, values: Tensor, moving: Tensor) -> Tensor:
         """Values (B, …) with those of the scenes that move replaced."""
@@ -156,10 +163,12 @@ def stream_rollout(
     frames: int,
     monitor: Monitor | None = None,
     prescribed: Prescribed | None = None,
+    noise: Noise | None = None,
 ) -> Iterator[Rollout]:
     """Predict `frames` frames of positions and evolving fields without gradients, yielding up to m as they are made.
 
-    With particles that enter and leave, and obstacles that move, as `prescribed`. Positions of particles that are not
+    With particles that enter and leave, and obstacles that move, as `prescribed`; with `noise` for a stochastic
+    processor, which without any predicts one future. Positions of particles that are not
     there, which have left through an open axis or as prescribed, or are yet to enter, are NaN.
 
     Warns if the emulator is in training mode, in which constraints do not act.
@@ -173,7 +182,7 @@ def stream_rollout(
     frames = check_whole("frames", frames, 0)
     warn_of_training_mode(emulator)
     check_inputs(emulator, particles)
-    bundles = unroll(emulator, particles, -(-frames // emulator.frames), monitor, frames, prescribed)
+    bundles = unroll(emulator, particles, -(-frames // emulator.frames), monitor, frames, prescribed, noise)
     made = 0
     while made < frames:
         with torch.no_grad():  # entered anew for each bundle: a suspended generator must not leak the mode
@@ -202,10 +211,11 @@ def predict_rollout(
     frames: int,
     monitor: Monitor | None = None,
     prescribed: Prescribed | None = None,
+    noise: Noise | None = None,
 ) -> Rollout:
     """Predict `frames` frames of positions and evolving fields without gradients, as `stream_rollout`."""
     batch, *rest = particles.position.shape
-    parts = list(stream_rollout(emulator, particles, frames, monitor, prescribed)) if batch else []
+    parts = list(stream_rollout(emulator, particles, frames, monitor, prescribed, noise)) if batch else []
     if parts:
         return Rollout.join(parts)
     none = particles.position.new_zeros(batch, frames, *rest)  # of no scene, or of no frame
@@ -219,17 +229,19 @@ def unroll_with_gradients(
     call: Call,
     state_after: Callable[[Bundle, Particles], Particles] = Bundle.state_after,
     prescribed: Prescribed | None = None,
+    noise: Sequence[Tensor] | None = None,
 ) -> Iterator[Bundle]:
     """Predict bundle after bundle with gradients, each by a `call` such as `recomputed`.
 
-    The next bundle starts from the `state_after` a bundle, of what that started from, with what is `prescribed`.
+    The next bundle starts from the `state_after` a bundle, of what that started from, with what is `prescribed`. A
+    stochastic processor reads the `noise` (B, Z, *S) of each call.
     Positions of particles that are not there are finite, and mean nothing.
     """
     exchange = Exchange(emulator, prescribed)
     particles = exchange.start(particles)
     context = exchange.first_context(particles)
     for index in range(bundles):
-        bundle = call(emulator, particles, context)
+        bundle = call(emulator, particles, context if noise is None else replace(context, noise=noise[index]))
         yield bundle
         particles = exchange.after(state_after(bundle, particles), (index + 1) * emulator.frames)
         context = exchange.next_context(context, particles)

@@ -8,6 +8,7 @@ from nmpm.processors.base import ChannelLayers, GridLayout, GridProcessor, Proce
 from nmpm.processors.baselines import Identity, Pointwise
 from nmpm.processors.fourier import FFNO, FNO, TFNO
 from nmpm.processors.patched import Patched
+from nmpm.processors.stochastic import Stochastic
 from nmpm.processors.unet import UNet
 from nmpm.processors.ushape import ConvNeXt, UNetModern
 
@@ -24,6 +25,7 @@ __all__ = [
     "Patched",
     "Pointwise",
     "Processor",
+    "Stochastic",
     "UNet",
     "UNetModern",
 ]

@@ -65,11 +65,13 @@ class GridProcessor(nn.Module, ABC):
         alignment: Cells by whose multiples the input may be shifted so that the output is shifted alike, e.g. 2 for a
             network that works on a grid half as fine.
         channel_layers: The layers by which a trained network is given other channels; None, as here, if it cannot be.
+        noise: Channels of standard normal numbers that it reads after the grid state; without them, it takes zeros.
     """
 
     radius: int | None = None
     alignment: int = 1
     channel_layers: ChannelLayers | None = None
+    noise: int = 0
 
     @abstractmethod
     def forward(self, grid: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from nmpm.processors import (
     Patched,
     Pointwise,
     Processor,
+    Stochastic,
     UNet,
     UNetModern,
 )
@@ -52,6 +53,10 @@ class TestConvNeXt(ProcessorContract):
 
 class TestAxial(ProcessorContract):
     recipe = Axial(width=16, layers=2, heads=2, patch=4)
+
+
+class TestStochastic(ProcessorContract):
+    recipe = Stochastic(Patched(UNet(width=6, depth=1, perceptron=(5,))), fine=1, coarse=2, block=3)
 
 
 class TestPatched(ProcessorContract):

@@ -72,16 +72,22 @@ class Engine(ABC, Generic[Start, Values]):
         with _full_precision(device):
             start = self.rasterise(particles, context)
             seen = self.normalise(start, context)
-        output = self.network(seen)
+        output = self.network(seen, context.noise)
         with _full_precision(device):
             flight = self.fly(start, output, context)
             if self.emulator.constraints.density_cap and not self.emulator.training:
                 flight = self.spread(start, flight, context)
             return self.land(start, flight)
 
-    def network(self, seen: Tensor) -> Tensor:
-        """The network's output (B, m, C_out, *S), of its own precision and scale, for what it sees (B, C_in, *S)."""
+    def network(self, seen: Tensor, noise: Tensor | None) -> Tensor:
+        """The network's output (B, m, C_out, *S), of its own precision and scale.
+
+        Args:
+            seen: (B, C_in, *S) the normalised grid state.
+            noise: (B, Z, *S), if there is any.
+        """
         emulator = self.emulator
+        seen = seen if noise is None else torch.cat([seen, noise.to(seen.dtype)], dim=1)
         return emulator.runtime.fields(emulator.processor, seen, emulator.network_precision)
 
     def solids_ahead(self, particles: Particles) -> Tensor | None:

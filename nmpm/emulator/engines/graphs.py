@@ -88,7 +88,9 @@ class _Recording:
         self._lock = Lock()
         with torch.inference_mode(False), torch.no_grad():  # the copies' values change outside of inference mode, too
             budget = None if context.budget is None else _copy(context.budget)
-            copies = particles.map(_copy), dataclasses.replace(context, solid=_copy(context.solid), budget=budget)
+            noise = None if context.noise is None else _copy(context.noise)
+            still = dataclasses.replace(context, solid=_copy(context.solid), budget=budget, noise=noise)
+            copies = particles.map(_copy), still
             self._inputs = _inputs(*copies)
             self._replay, self._bundle = record(lambda: emulator.predict(*copies), particles.position.device)
 
@@ -111,8 +113,8 @@ def _copy(tensor: Tensor) -> Tensor:
 def _inputs(particles: Particles, context: RolloutContext) -> list[Tensor]:
     """All tensors that a call depends on but those of the emulator, in the order of `_key`."""
     given = [values for values in vars(particles).values() if isinstance(values, Tensor)]
-    budget = [] if context.budget is None else [context.budget]
-    return [*given, *particles.fields.values(), context.solid, *budget]
+    further = [values for values in (context.budget, context.noise) if values is not None]
+    return [*given, *particles.fields.values(), context.solid, *further]
 
 
 def _key(particles: Particles, inputs: Sequence[Tensor]) -> Hashable:
