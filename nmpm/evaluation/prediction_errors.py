@@ -23,18 +23,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nmpm.grid import Grid
 from nmpm.metrics import earth_mover_of_materials
-from nmpm.particles import Particles, Window
+from nmpm.metrics.quantities import counting_grid, energies, into_domain, measure_shape, volume_fractions
+from nmpm.particles import Window
 from nmpm.scene import Scene
-from nmpm.transfer import Linear, Nearest
 
 REVISION = 4
 """Increased whenever the same prediction gets other errors."""
 
-_MOST_CROWDED = 0.05  # of the occupied cells: those whose crowding is averaged
 _MOST_GAIN = 0.05  # of the initial energy: a prediction that gains more is unstable
-_CELL = 3.0  # particle spacings: side of the cells in which particles are counted
 _FIELD_FRAMES = 50  # at which fields are compared
 
 
@@ -81,10 +78,10 @@ def measure_errors(scene: Scene, window: Window, predicted: Tensor, measures: Me
         )
     if there is not None:
         return errors
-    kinetic, truth = (_energy(scene, *_path(window, positions))[0] for positions in (ours, theirs))
+    kinetic, truth = (energies(scene, *_path(window, positions))[0] for positions in (ours, theirs))
     errors["kinetic"] = float((kinetic - truth).abs().mean() / truth.mean().clamp(min=1e-300))
     if bool((window.gravity != 0).any()):
-        grid, state = _counting_grid(scene), window.initial
+        grid, state = counting_grid(scene), window.initial
         last = (predicted[:, -1], window.target[:, -1])
         shape, right = (measure_shape(scene, grid, state, into_domain(scene, position)) for position in last)
         errors |= {name: abs(float(shape[name] / right[name]) - 1) for name in ("height", "crowding")}
@@ -126,17 +123,15 @@ def field_error(
         volume: (N,) of each particle, in any unit; all the same when left out.
     """
     frames = _evenly_spaced(len(ours), _FIELD_FRAMES)
-    grid, kinds = _counting_grid(scene), torch.nn.functional.one_hot(material, len(scene.materials)).to(ours.dtype)
-    kinds = kinds if volume is None else kinds * volume.to(kinds).unsqueeze(-1)
-    values = kinds.expand(len(frames), -1, -1)
+    sizes = torch.ones(len(material), dtype=ours.dtype) if volume is None else volume
+    sizes = sizes.expand(len(frames), -1)
     if there is not None:
-        values = values * there[frames].unsqueeze(-1)
+        sizes = sizes * there[frames]
         ours, theirs = (
             path.where(there.unsqueeze(-1), path.new_tensor(scene.domain).mean(1)) for path in (ours, theirs)
         )
     first, second = (
-        Linear().p2g(values, grid.to_cells(into_domain(scene, path[frames]), path.dtype), grid)
-        for path in (ours, theirs)
+        volume_fractions(scene, counting_grid(scene), path[frames], material, sizes) for path in (ours, theirs)
     )
     wrong, total = (each.flatten(1).sum(1) for each in ((first - second).abs(), first + second))
     return _mean(wrong / total)
@@ -147,22 +142,9 @@ def _mean(values: Tensor) -> float:
     return float(values[~values.isnan()].mean())
 
 
-def into_domain(scene: Scene, position: Tensor) -> Tensor:
-    """Positions (..., D) moved into the domain: by whole periods, and to the border at walls."""
-    columns = []
-    for along, (low, high), periodic in zip(position.unbind(-1), scene.domain, scene.periodic, strict=True):
-        columns.append(low + (along - low).remainder(high - low) if periodic else along.clamp(low, high))
-    return torch.stack(columns, dim=-1)
-
-
 def _evenly_spaced(frames: int, count: int) -> NDArray[np.int64]:
     """Indices of `count` frames, or of all where there are fewer; the last is among them."""
     return np.unique(np.linspace(0, frames - 1, count + 1).round().astype(np.int64)[1:])
-
-
-def _counting_grid(scene: Scene) -> Grid:
-    longest = max(high - low for low, high in scene.domain)
-    return Grid.of(scene, max(1, round(longest / (_CELL * scene.particle_spacing))))
 
 
 def _path(window: Window, positions: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
@@ -193,7 +175,7 @@ def energy_gain(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor, v
         gravity: (D,) in length per frame squared.
         volume: (N,) of each particle, in any unit; all the same when left out.
     """
-    total = _energy(scene, path.double(), material, gravity.double(), volume)[1]
+    total = energies(scene, path.double(), material, gravity.double(), volume)[1]
     initial = float(total[0])
     return float(total.max() / initial - 1) if initial > 0 else 0.0
 
@@ -201,51 +183,3 @@ def energy_gain(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor, v
 def instability(gain: float) -> str:
     """Why a prediction that gains this share of the initial energy is unstable; empty if it is not."""
     return f"gains {gain:.0%} of energy" if gain > _MOST_GAIN else ""
-
-
-def _energy(
-    scene: Scene, path: Tensor, material: Tensor, gravity: Tensor, volume: Tensor | None = None
-) -> tuple[Tensor, Tensor]:
-    """Kinetic, and kinetic and potential energy per mass between frames, (T - 1,), of a path (T, N, D)."""
-    mass = torch.tensor(scene.densities or (1.0,) * len(scene.materials), dtype=torch.float64)[material]
-    mass = mass if volume is None else mass * volume
-    share = mass / mass.sum()
-    steps = path.diff(dim=0)
-    kinetic = (steps.square().sum(-1) * share).sum(-1) / 2
-    middle = (path[1:] + path[:-1]) / 2
-    low, high = torch.tensor(scene.bounds, dtype=torch.float64).T
-    floor = torch.where(gravity < 0, low, high)
-    return kinetic, kinetic - (((middle - floor) @ gravity) * share).sum(-1)
-
-
-def measure_shape(scene: Scene, grid: Grid, state: Particles, position: Tensor) -> dict[str, Tensor]:
-    """How high the material of B scenes stands, how many cells it occupies and how crowded these are.
-
-    Args:
-        scene: Gives the bounds.
-        grid: Whose cells are counted.
-        state: Gives gravity, which must not be zero, and which particles are real.
-        position: (B, N, D) in domain length, all finite.
-
-    Returns:
-        (B,) each: `height`, the mean above the lowest bound against gravity, in domain length; `occupied`, the cells
-        that hold a particle; `crowding`, the particles per occupied cell; `peak_crowding`, those per cell in the most
-        crowded twentieth of the occupied cells. Particles of several sizes count by their volume.
-    """
-    volume = state.present_volume
-    up = -torch.nn.functional.normalize(state.gravity, dim=-1)
-    low, high = position.new_tensor(scene.bounds).T
-    floor = torch.minimum(up * low, up * high).sum(-1)
-    heights = (position * up.unsqueeze(1)).sum(-1) - floor.unsqueeze(1)
-    real = volume.sum(1)
-    counts = Nearest().p2g(volume.unsqueeze(-1).to(position.dtype), grid.to_cells(position), grid).flatten(1)
-    occupied = (counts > 0).sum(1)
-    ranked = counts.sort(dim=1, descending=True).values
-    kept = (_MOST_CROWDED * occupied).ceil().clamp(min=1)
-    first = torch.arange(ranked.shape[1], device=ranked.device) < kept.unsqueeze(1)
-    return {
-        "height": (heights * volume).sum(1) / real,
-        "occupied": occupied.to(position.dtype),
-        "crowding": real / occupied,
-        "peak_crowding": (ranked * first).sum(1) / kept,
-    }

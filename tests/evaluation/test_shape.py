@@ -4,8 +4,8 @@ import pytest
 import torch
 from scenes import box, cloud
 
-from nmpm.evaluation.prediction_errors import measure_shape
 from nmpm.grid import Grid
+from nmpm.metrics.quantities import measure_shape
 
 
 def lattice_state(count: int, spacing: float, corner: tuple[float, float] = (0.1, 0.1)):

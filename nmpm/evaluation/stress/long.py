@@ -10,10 +10,10 @@ from torch import Tensor
 
 from nmpm.emulator import Emulator
 from nmpm.emulator.rollouts import stream
-from nmpm.evaluation.prediction_errors import measure_shape
 from nmpm.evaluation.stress.model import ModelUnderTest, simulate_beside, simulate_window
 from nmpm.evaluation.stress.results import Effort, TestResult
 from nmpm.evaluation.stress.trace import INVARIANTS, Trace, filled_volume, trace_rollout
+from nmpm.metrics.quantities import measure_shape
 from nmpm.particles import Particles
 from nmpm.sim.predictability import twin_of
 

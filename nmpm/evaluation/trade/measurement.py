@@ -18,11 +18,12 @@ from nmpm._support.progress import Step, progress_bar
 from nmpm.emulator.prescribed import with_predicted
 from nmpm.errors import NmpmError
 from nmpm.evaluation.machine import clock_for, describe_device, is_machine_failure, peak_bytes
-from nmpm.evaluation.prediction_errors import Measures, instability, into_domain, measure_errors, squared_errors
+from nmpm.evaluation.prediction_errors import Measures, instability, measure_errors, squared_errors
 from nmpm.evaluation.trade.choices import Choice, digest
 from nmpm.evaluation.trade.ranking import Point, Times
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.sweep import Sweep, Timing
+from nmpm.metrics.quantities import into_domain
 
 _WARM_UP = 16  # frames: kernels are chosen and code is compiled in them
 _TIMES = "times, all choices in turn"

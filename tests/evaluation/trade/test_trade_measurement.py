@@ -12,17 +12,13 @@ from nmpm.data.loading.recording import Recording
 from nmpm.emulator import rollout
 from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import free_fall
-from nmpm.evaluation.prediction_errors import (
-    field_error,
-    into_domain,
-    measure_errors,
-    recorded_energy_gain,
-)
+from nmpm.evaluation.prediction_errors import field_error, measure_errors, recorded_energy_gain
 from nmpm.evaluation.trade import Kind, Scenes, Store, measure
 from nmpm.evaluation.trade.choices import PredictorChoice, SimulatorChoice
 from nmpm.evaluation.trade.measurement import measure_accuracy
 from nmpm.evaluation.trade.report import csv_text
 from nmpm.evaluation.trade.sweep import Timing
+from nmpm.metrics.quantities import into_domain
 from nmpm.sim import load_preset
 from nmpm.sim.sph.preset import SphPreset
 from nmpm.sim.state import SimulatedTrajectory
