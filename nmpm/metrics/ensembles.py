@@ -108,7 +108,7 @@ def measure_quantities(scene: Scene, window: Window, before: Tensor, position: T
     Args:
         scene: Of the window.
         window: Of one scene; gives its start, materials, gravity and volumes.
-        before: (K, N, D) positions in the frame before.
+        before: (K, N, D) positions in the frame before, for the kinetic energy per mass in (length per frame)².
         position: (K, N, D). Where particles enter and leave, NaN of those that are absent; only the density is measured
             then.
     """
@@ -129,9 +129,8 @@ def measure_quantities(scene: Scene, window: Window, before: Tensor, position: T
     if bool((gravity != 0).any()):
         inside = into_domain(scene, position)
         quantities["height"] = mean_height(scene, inside, gravity.unsqueeze(0), volume.unsqueeze(0)).unsqueeze(1)
-    recorded = energies(scene, window.frames[0, 1:, moving].double(), material, gravity, volume)[0].mean()
-    kinetic = energies(scene, torch.stack([before, position]), material, gravity, volume)[0][0]
-    return quantities | {"kinetic": (kinetic / recorded.clamp(min=1e-300)).unsqueeze(1)}
+    kinetic = energies(scene, torch.stack([before, position]), material, gravity, volume)[0]
+    return quantities | {"kinetic": kinetic.T}
 
 
 class EnsembleScores:
@@ -168,11 +167,13 @@ class EnsembleScores:
         wanted = {end - back for end in ends.values() for back in (0, 1)}
         squared, kept = _consume(window, members, observed, wanted)
         row = {f"mse{name}": float(squared[:end].nanmean()) for name, end in ends.items()}
+        units = {"kinetic": _mean_kinetic_energy(self.scene, window)}
         for name, end in ends.items():
             truth = measure_quantities(self.scene, window, *window.recorded[:, [end, end + 1]].unbind(1))
             ensemble = measure_quantities(self.scene, window, kept[end - 1], kept[end])
             for quantity, values in ensemble.items():
-                row |= self._score(f"{quantity}{name}", values, truth[quantity][0])
+                unit = units.get(quantity, 1.0)
+                row |= self._score(f"{quantity}{name}", values / unit, truth[quantity][0] / unit)
         self.rows.append(row)
 
     def _score(self, name: str, members: Tensor, truth: Tensor) -> dict[str, float]:
@@ -182,7 +183,8 @@ class EnsembleScores:
             scores[f"energy_score_{name}"] = fair_energy_score(members, truth)
         if len(members) > 1:
             scores[f"spread²_{name}"], scores[f"skill²_{name}"] = spread_and_skill(members, truth)
-            differ = (members != truth).any(0)
+        differ = (members != truth).any(0)
+        if len(members) > 1 and bool(differ.any()):
             members, truth = members[:, differ], truth[differ]
             ranks = truth_ranks(members, truth, self._generator).bincount(minlength=len(members) + 1)
             self.ranks[name] = self.ranks.get(name, 0) + ranks
@@ -218,19 +220,33 @@ def _consume(
 
     Frame 0 is the start; NaN is the error of a frame without a particle.
     """
-    moving, numbers = window.mask[0], {model: data + 1 for data, model in enumerate(observed)}
-    squared = torch.full((len(observed),), torch.nan, dtype=torch.float64)
+    numbers = {model: data + 1 for data, model in enumerate(observed)}
+    squared = torch.zeros(len(observed), dtype=torch.float64)
     kept, frame = {0: window.recorded[:, 1]}, 0
     for part in members:
-        for position in part.cpu().unbind(1):
-            number, frame = numbers.get(frame), frame + 1
-            if number is None:
-                continue
-            error = (position[:, moving].double() - window.frames[0, number + 1, moving].double()).square()
-            if window.present is not None:
-                error = error[:, window.present[0, number + 1, moving]]
-            squared[number - 1] = error.mean()
-            if number in wanted:
-                kept[number] = position
+        models = [model for model in range(frame, frame + part.shape[1]) if model in numbers]
+        position = part[:, [model - frame for model in models]].cpu()
+        frame += part.shape[1]
+        for model, at in zip(models, position.unbind(1), strict=True):
+            if numbers[model] in wanted:
+                kept[numbers[model]] = at.clone()
+        targets = [numbers[model] - 1 for model in models]
+        squared[targets] = _squared_errors(window, targets, position)
     kept[0] = kept[0].expand(len(position), -1, -1)
     return squared, kept
+
+
+def _mean_kinetic_energy(scene: Scene, window: Window) -> float:
+    """Of the frames that are to be predicted, per mass, in (length per frame)²; tiny where nothing moves."""
+    moving = window.mask[0]
+    volume = None if window.volume is None else window.volume[0, moving].double()
+    path, material = window.frames[0, 1:, moving].double(), window.material[0, moving]
+    kinetic, _ = energies(scene, path, material, window.gravity[0].double(), volume)
+    return max(float(kinetic.mean()), 1e-300)
+
+
+def _squared_errors(window: Window, targets: list[int], position: Tensor) -> Tensor:
+    """Mean squared error of the members (M, t, N, D) in some of the frames to predict, (t,), float64."""
+    squared = (position - window.target[0, targets]).square().mean((0, 3)).double()
+    there = window.mask if window.present is None else window.present[0, 2:][targets] & window.mask
+    return squared.where(there, 0.0).sum(1) / there.sum(1)
