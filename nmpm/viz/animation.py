@@ -1,7 +1,9 @@
 """Animations: the trajectories side by side, as a GIF or an MP4.
 
-A frame is one panel per trajectory, with labels, errors, the time and a legend of the materials. A GIF has one palette
-for all frames, to avoid flicker.
+A frame is one panel per trajectory, with labels, errors, the time and a legend of the materials. A member of an
+ensemble is drawn over the share of members that are at each place, and charts below show derived quantities.
+
+A GIF has one palette for all frames, to avoid flicker.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from nmpm._support.colours import BACKGROUND, FAINT_TEXT, INTERIOR, OBSTACLE, TE
 from nmpm._support.progress import progress_bar
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import fit_camera
+from nmpm.viz.charts import ChartStrip
 from nmpm.viz.output import check_output, replace_picture
 from nmpm.viz.panel import PanelRenderer, format_time
 from nmpm.viz.trajectories import LabelledTrajectories
@@ -41,6 +44,7 @@ LAST_FRAME_SECONDS = 1.0
 MARGIN = 10
 PANEL_HEADER = 26
 FOOTER = 26
+STRIP_GAP = 8
 LINE_HEIGHT = 22
 FONT_SIZE = 13
 LEGEND_DOT = 9
@@ -72,14 +76,19 @@ class FrameRenderer:
         self._bold_font = ImageFont.truetype(fonts / "DejaVuSans-Bold.ttf", FONT_SIZE)
         self._title_height = LINE_HEIGHT if trajectories.title else 0
         panels_bottom = self._title_height + rows * (PANEL_HEADER + self._panel.height)
-        self._footer_baseline = panels_bottom + 18
         width = MARGIN + columns * (self._panel.width + MARGIN)
         self.width = width + width % 2
+        self._members = trajectories.members
+        has_charts = bool(self._members) and trajectories.frame_count > 1
+        self._strip = ChartStrip(trajectories, self.width) if has_charts else None
         # The legend takes a second footer line if it does not fit beside the time.
         time = self._text_width(self._time_text(trajectories.frame_count - 1)) + 2 * MARGIN + 20
         legend = sum(self._text_width(name) + LEGEND_DOT + 19 for name in self._legend)
         self._legend_height = LINE_HEIGHT if self._legend and time + legend > self.width else 0
-        height = panels_bottom + FOOTER + self._legend_height
+        self._strip_top = panels_bottom + STRIP_GAP
+        footer_top = panels_bottom + (STRIP_GAP + self._strip.image.height if self._strip else 0)
+        self._footer_baseline = footer_top + 18
+        height = footer_top + FOOTER + self._legend_height
         self.height = height + height % 2
         self._template = self._draw_template()
 
@@ -89,12 +98,15 @@ class FrameRenderer:
         draw = ImageDraw.Draw(image)
         for index, (label, position) in enumerate(self.trajectories.positions.items()):
             left, top = self._corner(index)
-            image.paste(Image.fromarray(self._panel.draw(position[frame])), (left, top))
+            members = [member[frame] for member in self._members.values()] if label in self._members else []
+            image.paste(Image.fromarray(self._panel.draw(position[frame], members)), (left, top))
             outside = self._panel.count_outside(position[frame])
             notes = [f"{outside} out of view"] if outside else []
             if label in self._errors:
                 notes.append(f"RMS error {format_distance(self.trajectories, self._errors[label][frame])}")
             draw.text((left + self._panel.width, top - 6), ", ".join(notes), FAINT_TEXT, self._font, anchor="rs")
+        if self._strip:
+            image.paste(self._strip.draw(frame), (0, self._strip_top))
         draw.text((MARGIN, self._footer_baseline), self._time_text(frame), TEXT, self._font, anchor="ls")
         return np.asarray(image)
 

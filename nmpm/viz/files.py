@@ -14,16 +14,21 @@ from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
 from nmpm.scene import Scene
-from nmpm.viz.trajectories import LabelledTrajectories, material_names
+from nmpm.viz.trajectories import Floats, LabelledTrajectories, material_names
 
+MEMBER = "member"
+"""Attribute of a trajectory of an ensemble: its number, counted from 0."""
 TOLERANCE = 1e-3
 """Share of the box by which first frames may differ where one file is the prediction of the other."""
+MEMBER_TOLERANCE = 3e-2
+"""The same where that is an ensemble, whose members may start from nudged positions."""
 
 
 def read_labelled(split: Split, index: int = 0, family: str | None = None) -> LabelledTrajectories:
     """Reads a trajectory, labelled "prediction" or "recorded" (or "simulated", where nmpm's simulators made it).
 
-    A prediction that has its truth beside it comes after that, over the frames that both have.
+    A prediction that has its truth beside it comes after that, over the frames that both have. One that is a member of
+    an ensemble, see `member_indices`, has the others as further members, over the frames that all have.
     With the fields of particles that the file's scene or metadata declare, see `nmpm.data.fields`.
 
     Args:
@@ -37,23 +42,24 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
     if not 0 <= index < len(split):
         raise DataError(f"{split.path} contains trajectories 0 … {len(split) - 1}, not {index}.")
     trajectory = split.read(index)
-    scene, names, static, prescribed, label = _describe(split, trajectory, family)
+    scene, names, static, prescribed, source = _describe(split, trajectory, family)
+    others = _read_further_members(split, index, trajectory)
+    label = f"member {trajectory.attributes[MEMBER]}" if others else source
     moving = ~np.isin(trajectory.particle_type, sorted(static))
     fields = read_fields(split, index, scene.particle_fields)
     position = trajectory.position
     positions = {label: position}
-    truth = split.fields(index).get(TRUTH) if label == "prediction" else None
+    truth = split.fields(index).get(TRUTH) if source == "prediction" else None
     if truth is not None:
         if truth.dtype.kind not in "iuf" or truth.ndim != 3 or truth.shape[1:] != position.shape[1:] or not len(truth):
             raise DataError(
                 f"{split.where(index)}: truth has the shape {truth.shape} and the type {truth.dtype}, beside positions"
                 f" of the shape {position.shape}. Both should be (frames, particles, dimensions) of the same particles."
             )
-        common = min(len(truth), len(position))
-        positions = {TRUTH: truth[:common], label: position[:common]}
-    frames = len(positions[label])
+        positions = {TRUTH: truth, label: position}
+    frames = min(len(each) for each in (*positions.values(), *others.values()))
     return LabelledTrajectories(
-        positions={name: position[:, moving] for name, position in positions.items()},
+        positions={name: position[:frames, moving] for name, position in positions.items()},
         material=material_names(trajectory.particle_type[moving], names),
         bounds=scene.bounds,
         dt=scene.dt,
@@ -61,10 +67,47 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
         obstacle=trajectory.position[0, ~moving],
         periodic=scene.periodic,
         gravity=trajectory_gravity(trajectory.attributes, scene, f"{split.path}, trajectory {index}"),
-        title=f"{split.path.name}, trajectory {index}",
+        title=f"{split.path.name}, " + (f"{len(others) + 1} members" if others else f"trajectory {index}"),
         fields={name: {label: values[:frames, moving]} for name, values in fields.items() if values.shape[1] > 1},
         prescribed=frozenset(names[number] for number in prescribed),
+        further_members={name: position[:frames, moving] for name, position in others.items()},
     )
+
+
+def member_indices(split: Split, index: int) -> range:
+    """The trajectories of the ensemble that one belongs to: neighbours whose attribute `member` counts up by one.
+
+    Only itself where it is no member of an ensemble.
+    """
+    first = last = index
+    number = _member_number(split, index)
+    while number is not None and first > 0 and _member_number(split, first - 1) == number - (index - first) - 1:
+        first -= 1
+    while number is not None and last + 1 < len(split) and _member_number(split, last + 1) == number + last + 1 - index:
+        last += 1
+    return range(first, last + 1)
+
+
+def _member_number(split: Split, index: int) -> int | None:
+    number = split.attributes(index).get(MEMBER)
+    return int(number) if isinstance(number, int | np.integer) else None
+
+
+def _read_further_members(split: Split, index: int, trajectory: Trajectory) -> dict[str, Floats]:
+    """Positions (T', N, D) of the other members of a trajectory's ensemble; a DataError for other particles."""
+    others = {}
+    for number in member_indices(split, index):
+        if number == index:
+            continue
+        other = split.read(number)
+        if not np.array_equal(other.particle_type, trajectory.particle_type):
+            raise DataError(
+                f"{split.where(number)}: member {other.attributes[MEMBER]} has other particles than member"
+                f" {trajectory.attributes[MEMBER]}: {len(other.particle_type)} and {len(trajectory.particle_type)}, or"
+                " of other types. Members of an ensemble are rollouts of the same particles."
+            )
+        others[f"member {other.attributes[MEMBER]}"] = other.position
+    return others
 
 
 def label_trajectory(
@@ -112,7 +155,7 @@ def combine(
         raise DataError(f"{both} do not show the same particles: their materials differ.")
     sides = np.ptp(np.array(reference.outer_bounds), axis=1)
     apart = float(np.nan_to_num(np.abs((first[0] - second[0]) / sides)).max())
-    if apart > TOLERANCE:
+    if apart > (MEMBER_TOLERANCE if other.further_members else TOLERANCE):
         raise DataError(
             f"{both} do not start at the same positions: a particle is {apart:.2g} of the box's side apart. Is it the"
             " same trajectory? --truth-trajectory chooses another."
@@ -128,7 +171,11 @@ def combine(
         for name in dict.fromkeys((*reference.fields, *other.fields))
     }
     return dataclasses.replace(
-        reference, positions={labels[0]: first[:frames], labels[1]: second[:frames]}, title=other.title, fields=fields
+        reference,
+        positions={labels[0]: first[:frames], labels[1]: second[:frames]},
+        title=other.title,
+        fields=fields,
+        further_members={label: position[:frames] for label, position in other.further_members.items()},
     )
 
 

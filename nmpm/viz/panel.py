@@ -7,6 +7,7 @@ pixel is visible.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -16,6 +17,7 @@ from PIL import Image, ImageDraw
 
 from nmpm._support.colours import BACKGROUND, EDGE, INTERIOR, OBSTACLE, TEXT, WALL, material_colours, vary_brightness
 from nmpm.viz.camera import Camera, box_corners, fit_camera, vertical_axis
+from nmpm.viz.occupancy import CELL, LEVELS, band_colours, occupied_share
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
 SUPERSAMPLING = 3
@@ -53,8 +55,8 @@ class PanelRenderer:
         self.width = width
         self.height = max(1, round(width * self.camera.height / self.camera.width))
         self._scale = SUPERSAMPLING * width / self.camera.width
-        spacing = particle_spacing(trajectories.fullest_frame)
-        diameter = float(np.clip(DISC_DIAMETER * spacing * width / self.camera.width, *DIAMETER_LIMITS))
+        self._spacing = particle_spacing(trajectories.fullest_frame)
+        diameter = float(np.clip(DISC_DIAMETER * self._spacing * width / self.camera.width, *DIAMETER_LIMITS))
         self._disc = _disc_offsets(SUPERSAMPLING * diameter / 2)
         colours = material_colours(trajectories.materials)
         materials = np.array([colours[name] for name in trajectories.material.tolist()], dtype=np.uint8)
@@ -62,12 +64,13 @@ class PanelRenderer:
         obstacles = np.tile(np.array(OBSTACLE, dtype=np.uint8), (len(trajectories.obstacles), 1))
         self._colours = np.concatenate([obstacles, vary_brightness(materials)])
 
-    def draw(self, position: Floats) -> NDArray[np.uint8]:
+    def draw(self, position: Floats, ensemble: Sequence[Floats] = ()) -> NDArray[np.uint8]:
         """Draws one frame.
 
         Args:
             position: (N, D) in domain length; particles that are not there, NaN, or outside of the window are omitted
                 (see `count_outside`).
+            ensemble: (N, D) of each member; behind the particles, the picture is darker where more of them are.
 
         Returns:
             (height, width, 3), top row first.
@@ -79,6 +82,8 @@ class PanelRenderer:
             order = np.argsort(projected[:, 2], kind="stable")
             projected, colours = projected[order], _fade_by_depth(colours[order], projected[order, 2])
         canvas = self._background.copy()
+        if ensemble:
+            self._draw_bands(canvas, ensemble)
         self._draw_discs(canvas, projected, colours)
         # RGBX because reducing RGBA would first multiply by the opacity, which is 1 everywhere.
         image = Image.frombuffer("RGBX", canvas.shape[::-1], canvas.tobytes(), "raw", "RGBX", 0, 1)
@@ -113,6 +118,25 @@ class PanelRenderer:
         for start in range(0, len(centre), step):
             part = slice(start, start + step)
             flat[centre[part, None] + offsets] = values[part]
+
+    def _draw_bands(self, canvas: NDArray[np.uint32], ensemble: Sequence[Floats]) -> None:
+        """Tints the places that at least some shares of the members occupy, as seen by the camera."""
+        width, height = self.camera.width, self.camera.height
+        cell = max(min(CELL * self._spacing, width / 20), width / self.width)
+        columns, rows = math.ceil(width / cell), math.ceil(height / cell)
+        seen = (self.camera.project(self.trajectories.wrap(position))[:, :2] for position in ensemble)
+        share = occupied_share(seen, np.zeros(2), cell, (columns, rows)).T[::-1].astype(np.float32)
+        box = (0.0, rows - height / cell, width / cell, float(rows))
+        smooth = np.asarray(Image.fromarray(share).resize(canvas.shape[::-1], Image.Resampling.BICUBIC, box))
+        colours = np.array([INTERIOR, BACKGROUND, *band_colours(self.trajectories.materials)], dtype=np.uint8)
+        interior, background, *tints = (
+            np.pad(colours, ((0, 0), (0, 1)), constant_values=255).view(np.uint32)[:, 0].tolist()
+        )
+        free = canvas == interior
+        if self.camera.has_depth:
+            free |= canvas == background
+        for level, tint in zip(LEVELS, tints, strict=True):
+            canvas[free & (smooth >= level)] = tint
 
     def _draw_gravity(self, draw: ImageDraw.ImageDraw, tilt: float) -> None:
         """An arrow that points where gravity does, on a disc in the upper right corner."""

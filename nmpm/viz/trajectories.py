@@ -39,6 +39,8 @@ class LabelledTrajectories:
         fields: Further numbers of the particles by name and label, (T, N), or (1, N) if constant in time; a trajectory
             may lack one. The viewer colours by them.
         prescribed: Names of materials that are not predicted, so that errors leave them out.
+        further_members: Where the last of `positions` is a member of an ensemble: the others by label, (T, N, D) each.
+            They are drawn behind it, and in bands of the share of members; positions are never averaged.
 
     Raises:
         DataError: if shapes do not match, or a position or a field is not finite; positions may be NaN on all axes.
@@ -55,6 +57,7 @@ class LabelledTrajectories:
     title: str = ""
     fields: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
     prescribed: frozenset[str] = frozenset()
+    further_members: Mapping[str, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "material", np.asarray(self.material, dtype=np.str_))
@@ -96,6 +99,17 @@ class LabelledTrajectories:
             title=title,
             fields=fields or {},
         )
+
+    @property
+    def members(self) -> dict[str, Floats]:
+        """The positions of all members of the ensemble by label, the one of `positions` first; none without one."""
+        shown = list(self.positions)[-1]
+        return {shown: self.positions[shown], **self.further_members} if self.further_members else {}
+
+    @property
+    def truth(self) -> Floats | None:
+        """What an ensemble, or a prediction, should be: the first of several trajectories."""
+        return next(iter(self.positions.values())) if len(self.positions) > 1 else None
 
     @property
     def frame_count(self) -> int:
@@ -145,23 +159,29 @@ class LabelledTrajectories:
         indices = np.linspace(0, self.frame_count - 1, min(count, self.frame_count))
         return [int(frame) for frame in np.round(indices)]
 
+    @property
+    def predicted(self) -> NDArray[np.bool_]:
+        """Whether each particle is predicted, (N,)."""
+        return ~np.isin(self.material, list(self.prescribed))
+
     def rms_errors(self) -> dict[str, NDArray[np.float64]]:
         """Root mean square position error of each later trajectory against the first, (T,) in domain length.
 
         Of the particles that are there in both; 0 where none is.
         """
         reference, *others = self.positions
-        errors = {label: np.zeros(self.frame_count) for label in others}
-        predicted = ~np.isin(self.material, list(self.prescribed))
-        for label, squares in errors.items():
-            for axis, period in enumerate(self.periods):
-                first = self.positions[reference][:, predicted, axis]
-                difference = self.positions[label][:, predicted, axis].astype(np.float64) - first
-                if period:
-                    difference -= period * np.round(difference / period)
-                there = ~np.isnan(difference)
-                squares += np.square(np.where(there, difference, 0.0)).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
-        return {label: np.sqrt(squares) for label, squares in errors.items()}
+        return {label: self.rms_distance(self.positions[reference], self.positions[label]) for label in others}
+
+    def rms_distance(self, first: Floats, second: Floats) -> NDArray[np.float64]:
+        """Root mean square distance (T,) of the predicted particles of two trajectories (T, N, D), as `rms_errors`."""
+        squares = np.zeros(self.frame_count)
+        for axis, period in enumerate(self.periods):
+            difference = second[:, self.predicted, axis].astype(np.float64) - first[:, self.predicted, axis]
+            if period:
+                difference -= period * np.round(difference / period)
+            there = ~np.isnan(difference)
+            squares += np.square(np.where(there, difference, 0.0)).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
+        return np.sqrt(squares)
 
     @property
     def fullest_frame(self) -> Floats:
@@ -186,7 +206,7 @@ class LabelledTrajectories:
             raise DataError(
                 f"Positions to draw have shape {shape}; expected (frames, particles, 2 or 3), none of them 0."
             )
-        for label, position in self.positions.items():
+        for label, position in {**self.positions, **self.further_members}.items():
             if position.shape != shape:
                 raise DataError(
                     f"Trajectory {label!r} has shape {position.shape}, but {first!r} has {shape}: reduce both to the"

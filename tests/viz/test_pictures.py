@@ -143,10 +143,10 @@ def test_a_full_disk_or_an_interruption_keeps_the_old_file(falling, tmp_path, mo
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     draw, calls = PanelRenderer.draw, iter(range(1000))
 
-    def draw_some(self, position):
+    def draw_some(self, *positions):
         if next(calls) == 9:
             raise KeyboardInterrupt
-        return draw(self, position)
+        return draw(self, *positions)
 
     monkeypatch.setattr(PanelRenderer, "draw", draw_some)
     with pytest.raises(KeyboardInterrupt):

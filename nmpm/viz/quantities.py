@@ -1,0 +1,116 @@
+"""Numbers derived from the positions of all particles, frame by frame, and the bands that an ensemble's members fill.
+
+The quantities are those of `nmpm.metrics.quantities`, for pictures without torch; all particles count alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nmpm.viz.camera import box_corners, vertical_axis
+from nmpm.viz.trajectories import Floats, LabelledTrajectories
+
+FRONT = 0.95
+"""Share of the particles that is behind the front."""
+BANDS = (0.5, 0.9)
+"""Shares of the members that the bands of a chart contain."""
+Curve = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class QuantityCurves:
+    """A quantity along the frames, of each member of an ensemble and of its truth.
+
+    Args:
+        name: In words, with the unit.
+        members: (M, T).
+        truth: (T,); None without a truth.
+    """
+
+    name: str
+    members: Curve
+    truth: Curve | None
+
+    def bands(self) -> dict[float, Curve]:
+        """Lower and upper end (2, T) of the interval that contains a share of the members, for each of `BANDS`."""
+        return {
+            share: np.quantile(self.members, [(1 - share) / 2, (1 + share) / 2], axis=0) for share in reversed(BANDS)
+        }
+
+
+def quantity_curves(trajectories: LabelledTrajectories) -> list[QuantityCurves]:
+    """Mean height, front and kinetic energy of an ensemble's members, and with a truth their errors against it."""
+    members, truth = list(trajectories.members.values()), trajectories.truth
+    quantities = {
+        "mean height (length)": mean_height,
+        "front (length)": front,
+        "kinetic energy (length²/s²)": kinetic_energy,
+    }
+    curves = [
+        QuantityCurves(
+            name,
+            np.stack([measure(trajectories, member) for member in members]),
+            None if truth is None else measure(trajectories, truth),
+        )
+        for name, measure in quantities.items()
+    ]
+    if truth is None:
+        return curves
+    errors = np.stack([trajectories.rms_distance(truth, member) for member in members])
+    return [*curves, QuantityCurves("RMS position error (length)", errors, None)]
+
+
+def mean_height(trajectories: LabelledTrajectories, position: Floats) -> Curve:
+    """Mean height (T,) above the lowest bound against gravity, of positions (T, N, D); 0 where no particle is."""
+    up = -_down(trajectories)
+    heights = trajectories.wrap(position[:, trajectories.predicted]) @ up
+    return _mean(heights - (box_corners(trajectories.bounds) @ up).min())
+
+
+def front(trajectories: LabelledTrajectories, position: Floats) -> Curve:
+    """How far the particles have advanced, (T,): the distance across gravity that 95% of them are within.
+
+    It counts from their mean position in the first frame; 0 where no particle is.
+    """
+    position, down = position[:, trajectories.predicted], _down(trajectories)
+    offset = position - np.nanmean(position[0].astype(np.float64), axis=0)
+    for axis, period in enumerate(trajectories.periods):
+        if period:
+            offset[..., axis] -= period * np.round(offset[..., axis] / period)
+    offset -= (offset @ down)[..., None] * down
+    distance = np.sort(np.sqrt(np.square(offset).sum(axis=-1)), axis=1)  # (NaN comes last)
+    there = (~np.isnan(distance)).sum(axis=1)
+    index = np.maximum(np.ceil(FRONT * there - 1e-9).astype(int) - 1, 0)
+    return np.where(there > 0, distance[np.arange(len(distance)), index], 0.0)
+
+
+def kinetic_energy(trajectories: LabelledTrajectories, position: Floats) -> Curve:
+    """Kinetic energy per mass (T,), in length² per second², of the motion from each frame to the next.
+
+    The last frame has that of the frame before.
+    """
+    position = position[:, trajectories.predicted].astype(np.float64)
+    if len(position) < 2:
+        return np.zeros(len(position))
+    squares = np.zeros((len(position) - 1, position.shape[1]))
+    for axis, period in enumerate(trajectories.periods):
+        step = np.diff(position[..., axis], axis=0)
+        squares += np.square(step - period * np.round(step / period) if period else step)
+    energy = _mean(squares) / (2 * trajectories.dt**2)
+    return np.append(energy, energy[-1])
+
+
+def _down(trajectories: LabelledTrajectories) -> NDArray[np.float64]:
+    """(D,) unit vector along gravity; against the axis that is drawn vertically where it is zero or not known."""
+    gravity = np.array(trajectories.gravity or np.zeros(trajectories.dim), dtype=np.float64)
+    strength = float(np.linalg.norm(gravity))
+    return gravity / strength if strength else -np.eye(trajectories.dim)[vertical_axis(trajectories)]
+
+
+def _mean(values: NDArray[np.float64]) -> Curve:
+    """Means (T,) over the particles that are there of values (T, N); 0 where none is."""
+    there = ~np.isnan(values)
+    return np.asarray(np.where(there, values, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1))
