@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -64,6 +64,7 @@ class Monitor:
             obstacles move, axes are open, or particles enter.
         crowding: Largest volume fraction of a cell, measured every 16th bundle; the largest that the network is shown
             when left out.
+        first_scene: Number of the batch's first scene, in incidents.
 
     Attributes:
         incidents: The first of each kind in this rollout.
@@ -76,6 +77,7 @@ class Monitor:
     speed: float = 4.0
     energy_gain: float = MOST_GAIN
     crowding: float | None = None
+    first_scene: int = 0
     incidents: list[Incident] = field(default_factory=list)
     peaks: dict[str, float] = field(default_factory=dict)
     at_walls: int = 0
@@ -180,12 +182,24 @@ class Monitor:
         self.peaks[what] = max(self.peaks.get(what, -math.inf), worst)
         if not worst > limit or any(incident.what == what for incident in self.incidents):
             return
-        incident = Incident(what, frame, int(values.argmax()), worst, limit)
+        incident = Incident(what, frame, self.first_scene + int(values.argmax()), worst, limit)
         self.incidents.append(incident)
         if self.policy is Policy.STOP:
             raise RolloutStoppedError(f"The rollout was stopped: {incident}. {self.report()}")
         if self.policy is Policy.WARN:
             warnings.warn(f"The rollout passed a limit: {incident}.", stacklevel=6)
+
+    def gather(self, parts: Sequence[Monitor]) -> None:
+        """Adopt what monitors of the parts of a batch, of about as many scenes each, have measured."""
+        first: dict[str, Incident] = {}
+        for incident in sorted((one for part in parts for one in part.incidents), key=lambda one: one.frame):
+            first.setdefault(incident.what, incident)
+        self.incidents = list(first.values())
+        names = dict.fromkeys(name for part in parts for name in part.peaks)
+        self.peaks = {name: max(part.peaks.get(name, -math.inf) for part in parts) for name in names}
+        self._frames = max((part._frames for part in parts), default=0)
+        self.at_walls = sum(part.at_walls for part in parts)
+        self.rest_share = sum(part.rest_share for part in parts) / max(1, len(parts))
 
     def report(self) -> str:
         """A summary of the rollout in a sentence or two."""

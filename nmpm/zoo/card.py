@@ -30,6 +30,13 @@ def stated_error(card: Mapping[str, Any], name: str = "mse") -> float | None:
     return float(value) if is_finite(value) else None
 
 
+def stated_nudge(card: Mapping[str, Any]) -> float | None:
+    """Cells by which starts of members are displaced, as calibrated; None where a card states no such number."""
+    ensemble = card.get("ensemble")
+    value = ensemble.get("nudge") if isinstance(ensemble, Mapping) else None
+    return float(value) if is_finite(value) and value >= 0 else None
+
+
 def stated_milliseconds(card: Mapping[str, Any]) -> dict[str, float]:
     """Milliseconds per frame by hardware, as a card states them; malformed ones are left out."""
     speed = card.get("speed")

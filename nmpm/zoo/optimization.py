@@ -24,6 +24,7 @@ AUTO = "auto"
 """Stands for the fastest of `RUNTIMES` that can run the model here, as measured."""
 TOLERANCE = 1e-3
 """Cells by which positions after one bundle may differ from torch's in float32."""
+_EXAMPLE = 300  # particles of the example by which runtimes are compared
 _SPEED = 0.2  # cells per frame, of the particles of the example: at rest, the network would have little to say
 _BUNDLES, _ROUNDS = 4, 3  # of the rollouts that are timed
 _LOG = logging.getLogger(__name__)
@@ -36,6 +37,11 @@ def fitting_count(model: Pretrained, count: int, blocks: int | None = None) -> i
     except ConfigError:
         return fitting_count(model, count // 2, blocks) if count > 1 else count
     return count
+
+
+def small_example(model: Pretrained) -> Particles:
+    """The state by which runtimes are compared."""
+    return model.example(count=fitting_count(model, _EXAMPLE)).to(model.emulator.device)
 
 
 def optimize(emulator: Emulator, runtime: str | Runtime, make_example: Callable[[], Particles]) -> Emulator:

@@ -18,29 +18,24 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from nmpm._support.devices import find_device
-from nmpm._support.numbers import check_whole
 from nmpm.data.format import Trajectory
-from nmpm.data.initial_states import thrown_blocks
 from nmpm.emulator import NETWORK_PRECISIONS, Emulator, Prescribed, Rollout, differentiable_rollout, predict_rollout
-from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.emulator.input_checks import warn_of_start_outside
+from nmpm.emulator.members import nudge_of, predict_members
 from nmpm.emulator.runtimes import Runtime
 from nmpm.emulator.similarity import Match
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
-from nmpm.zoo.card import preset_of
+from nmpm.zoo.card import preset_of, stated_nudge
 from nmpm.zoo.matching import match_data
-from nmpm.zoo.optimization import AUTO, fitting_count, optimize
-from nmpm.zoo.starts import state_of
+from nmpm.zoo.optimization import AUTO, optimize, small_example
+from nmpm.zoo.starts import state_of, thrown_state
 from nmpm.zoo.states import TOO_FAST, Bodies, StateBuilder
 
 if TYPE_CHECKING:
     from nmpm.data.datamodule import TrajectoryDataModule
     from nmpm.data.dataset import Dataset
-
-_EXAMPLE = 300
-"""Particles of the example by which runtimes are compared."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +92,7 @@ class Pretrained:
         bodies: Bodies | None = None,
         volume: ArrayLike | Tensor | None = None,
     ) -> Particles:
-        """A state to start a rollout from, of N particles in each of B scenes, in D dimensions.
+        """A state to start a rollout from, per frame on the model's device: N particles in each of B scenes, D axes.
 
         Args:
             position: (N, D) or (B, N, D), in domain length.
@@ -113,9 +108,6 @@ class Pretrained:
             bodies: Obstacles of `nmpm.obstacles`, of D dimensions: a list for all scenes, or a list for each of B. To
                 their parameters, such as angles and sizes, gradients flow.
             volume: (N,) or (B, N) volumes of the particles, as multiples of `scene.particle_volume`; 1 when left out.
-
-        Returns:
-            The state on the model's device, with velocities and gravity converted to frames.
 
         Raises:
             DataError: if shapes do not fit together, values are not finite, a particle is outside of the domain or far
@@ -172,17 +164,7 @@ class Pretrained:
             ConfigError: if a number is too small, or the blocks do not fit into the box.
             DataError: if gravity is not the model's.
         """
-        blocks = len(self.scene.materials) if blocks is None else blocks
-        for name, value, least in (("seed", seed, 0), ("count", count, 1), ("blocks", blocks, 1)):
-            check_whole(name, value, least)
-        try:
-            state = thrown_blocks(self.scene, count=count, blocks=blocks, seed=seed)
-        except ValueError as error:
-            raise ConfigError(f"{error} Use fewer particles or more blocks.") from error
-        if gravity is None:
-            return with_usual_gravity(self.emulator, state)
-        builder = StateBuilder(self.emulator, state.position, state.position.dtype)
-        return dataclasses.replace(state, gravity=builder.gravity(gravity))
+        return thrown_state(self, seed, count, blocks, gravity)
 
     def with_network(self, precision: str) -> Pretrained:
         """The same model with the network's weights in "float32" or, faster on most processors, in "bfloat16"."""
@@ -243,11 +225,7 @@ class Pretrained:
             ConfigError: if the runtime is not installed, cannot run the model here, or computes something else.
         """
         model = self if precision is None else self.with_network(precision)
-
-        def make_example() -> Particles:
-            return model.example(count=fitting_count(model, _EXAMPLE)).to(model.emulator.device)
-
-        return dataclasses.replace(model, emulator=optimize(model.emulator, runtime, make_example))
+        return dataclasses.replace(model, emulator=optimize(model.emulator, runtime, lambda: small_example(model)))
 
     def explain(self) -> None:
         """Print what computes rollouts and trainings on the model's device, and why nothing faster does."""
@@ -266,7 +244,16 @@ class Pretrained:
             return self
         return dataclasses.replace(self, emulator=copy.deepcopy(self.emulator).to(target))
 
-    def rollout(self, state: Particles, frames: int, prescribed: Prescribed | None = None) -> Tensor:
+    @property
+    def nudge(self) -> float:
+        """Standard deviation of the displacements of members' starts, in cells: the card's, else the emulator's."""
+        stated = stated_nudge(self.card)
+        return nudge_of(self.emulator, None) if stated is None else stated
+
+    def rollout(
+        self, state: Particles, frames: int, prescribed: Prescribed | None = None,
+        members: int | None = None, seed: int = 0, nudge: float | None = None,
+    ) -> Tensor:  # fmt: skip
         """Predict positions (B, frames, N, D) in domain length from a state, whose own frame is not among them.
 
         Args:
@@ -275,16 +262,31 @@ class Pretrained:
             prescribed: Obstacles that move, `Prescribed.obstacles(positions)`, or particles that enter and leave too,
                 `Prescribed.of(window)`. Positions of particles that are not there are NaN, as are those of particles
                 that have left through an open axis.
+            members: So many rollouts of each scene, (M, B, frames, N, D), see `nmpm.emulator.members`: by the noise
+                that the model was trained with, or else from nudged starts. None for one, (B, frames, N, D).
+            seed: Of members: each depends on it, its number and its scene, not on how many there are.
+            nudge: Standard deviation of the displacements of members' starts in cells; `model.nudge` if left out.
+
+        Raises:
+            ConfigError: if a number is too small, or a nudge is given without members.
 
         Warns:
             UserWarning: if particles start outside of the bounds, into which the first frame moves them.
         """
-        return self.predict(state, frames, prescribed).position
+        return self.predict(state, frames, prescribed, members, seed, nudge).position
 
-    def predict(self, state: Particles, frames: int, prescribed: Prescribed | None = None) -> Rollout:
+    def predict(
+        self, state: Particles, frames: int, prescribed: Prescribed | None = None,
+        members: int | None = None, seed: int = 0, nudge: float | None = None,
+    ) -> Rollout:  # fmt: skip
         """As `rollout`, with the evolving fields of the particles, such as a temperature, beside their positions."""
         there, given = state.to(self.emulator.device), prescribed and prescribed.to(self.emulator.device)
         warn_of_start_outside(self.emulator, there)
+        if members is not None:
+            size = self.nudge if nudge is None else nudge
+            return predict_members(self.emulator, there, frames, members, seed, size, given)
+        if nudge is not None:
+            raise ConfigError(f"nudge = {nudge!r} displaces the starts of members: give members=8, too.")
         return predict_rollout(self.emulator, there, frames, prescribed=given)
 
     def differentiable_rollout(self, state: Particles, frames: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""States to start a rollout from, taken out of recorded trajectories."""
+"""States to start a rollout from: thrown blocks, and frames of recorded trajectories."""
 
 from __future__ import annotations
 
@@ -11,20 +11,39 @@ import numpy as np
 import torch
 
 from nmpm._support.messages import suggestion
+from nmpm._support.numbers import check_whole
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.gravity import trajectory_gravity
+from nmpm.data.initial_states import thrown_blocks
 from nmpm.data.loading.model_frames import model_velocity
 from nmpm.data.statistics import displacements
 from nmpm.data.volumes import relative_volumes
+from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
+from nmpm.zoo.states import StateBuilder
 
 if TYPE_CHECKING:
     from nmpm.zoo.pretrained import Pretrained
 
 _SAME_GRAVITY = 0.05
 """Share of the model's gravity by which that of data may differ, as it may be measured."""
+
+
+def thrown_state(model: Pretrained, seed: int, count: int, blocks: int | None, gravity: Any) -> Particles:
+    """Blocks of particles thrown into the scene's box, for a model; see `Pretrained.example`."""
+    blocks = len(model.scene.materials) if blocks is None else blocks
+    for name, value, least in (("seed", seed, 0), ("count", count, 1), ("blocks", blocks, 1)):
+        check_whole(name, value, least)
+    try:
+        state = thrown_blocks(model.scene, count=count, blocks=blocks, seed=seed)
+    except ValueError as error:
+        raise ConfigError(f"{error} Use fewer particles or more blocks.") from error
+    if gravity is None:
+        return with_usual_gravity(model.emulator, state)
+    builder = StateBuilder(model.emulator, state.position, state.position.dtype)
+    return dataclasses.replace(state, gravity=builder.gravity(gravity))
 
 
 def state_of(

@@ -115,3 +115,16 @@ def test_a_golden_rollout_of_one_block_fits_where_blocks_of_each_material_do():
     golden = golden_rollout(mixed.emulator)
     assert golden["count"] == fitting_count(mixed, 300, blocks=1)
     assert golden_distance(mixed, golden) == 0
+
+
+def test_members_start_from_the_cards_nudge_and_are_those_of_one_rollout_without(model):
+    state = model.example(count=60)
+    assert model.nudge == 0.1
+    calibrated = dataclasses.replace(model, card={"ensemble": {"nudge": 0.3}})
+    wide, narrow = (one.rollout(state, 4, members=3, seed=1) for one in (calibrated, model))
+    assert wide.shape == (3, 1, 4, state.position.shape[1], 2)
+    assert torch.equal(wide, model.rollout(state, 4, members=3, seed=1, nudge=0.3))
+    assert wide.std(0).mean() > 2 * narrow.std(0).mean()
+    assert torch.equal(model.rollout(state, 4, members=1, nudge=0)[0], model.rollout(state, 4))
+    with pytest.raises(ConfigError, match="give members"):
+        model.rollout(state, 4, nudge=0.1)

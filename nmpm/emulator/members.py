@@ -1,0 +1,197 @@
+"""Members: M rollouts from one state, which show how far apart its futures come.
+
+They differ by the noise that a stochastic processor reads; members of a deterministic emulator start from positions
+that are displaced by Gaussian numbers, σ cells along each axis. Member k of a scene depends on the seed, on k and on
+the scene, not on the number of members: only rounding, which differs between batches, may tell two calls apart.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nmpm._support.numbers import check_whole, is_finite
+from nmpm.emulator.constraints import distance_beyond
+from nmpm.emulator.engines.torch.contact import Contact, obstacle_share
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.monitor import Monitor
+from nmpm.emulator.noise import Noise
+from nmpm.emulator.prescribed import Prescribed
+from nmpm.emulator.rollouts import Rollout, stream_rollout
+from nmpm.errors import ConfigError
+from nmpm.particles import Particles
+
+NUDGE = 0.1
+"""Standard deviation, in cells, of the displacements of starts where none was calibrated."""
+MOST_SCENES = 8
+"""Scenes of a batch on a CPU, where more are no faster; networks round alike in batches of 2 to 8."""
+MOST_CELLS = 2**21
+"""Grid cells of all scenes of a batch, which bound its memory to some GB."""
+
+
+def check_members(members: Any, seed: Any, nudge: Any) -> None:
+    """Raise ConfigError unless there is a member or more, the seed is 0 or more, and so is the nudge, or None."""
+    check_whole("members", members, 1)
+    check_whole("seed", seed, 0)
+    if nudge is not None and not (is_finite(nudge) and nudge >= 0):
+        raise ConfigError(f"nudge = {nudge!r}: it must be a number of cells, 0 or more, such as {NUDGE}.")
+
+
+def predict_members(
+    emulator: Emulator,
+    state: Particles,
+    frames: int,
+    members: int,
+    seed: int = 0,
+    nudge: float | None = None,
+    prescribed: Prescribed | None = None,
+    monitor: Monitor | None = None,
+) -> Rollout:
+    """All frames of `stream_members` at once: positions (M, B, frames, N, D) and fields (M, B, frames, N)."""
+    parts = list(stream_members(emulator, state, frames, members, seed, nudge, prescribed, monitor))
+    scenes, count, dim = state.position.shape
+    shape = (members, scenes, frames, count)
+    if not parts:  # of no scene, or of no frame
+        none = state.position.new_zeros(*shape, dim)
+        return Rollout(none, dict.fromkeys(emulator.scene.evolving, none[..., 0]))
+    whole = Rollout.join(parts)
+    fields = {name: values.view(shape) for name, values in whole.fields.items()}
+    return Rollout(whole.position.view(*shape, dim), fields)
+
+
+def stream_members(
+    emulator: Emulator,
+    state: Particles,
+    frames: int,
+    members: int,
+    seed: int = 0,
+    nudge: float | None = None,
+    prescribed: Prescribed | None = None,
+    monitor: Monitor | None = None,
+) -> Iterator[Rollout]:
+    """Predict members of the rollouts from a state as `stream_rollout`, yielding up to m frames as they are made.
+
+    Members are computed in batches of as many scenes as `MOST_SCENES` and `MOST_CELLS` allow, all batches bundle by
+    bundle: memory holds the activations of one. Members that do not differ, without noise and nudge, are computed once.
+
+    Args:
+        emulator: In evaluation mode.
+        state: Of B scenes.
+        frames: How many.
+        members: M, how many rollouts of each scene.
+        seed: Of noise and nudges.
+        nudge: As for `member_starts`.
+        prescribed: As for `stream_rollout`, the same for all members.
+        monitor: Watches all members; its scenes are the M·B rows.
+
+    Yields:
+        Positions (M·B, <= m, N, D) and fields (M·B, <= m, N): rows 0 … B - 1 are those of member 0.
+
+    Raises:
+        ConfigError: if `members`, `seed` or `nudge` is too small.
+        DataError, RolloutStoppedError: as `stream_rollout`.
+    """
+    starts = member_starts(emulator, state, members, seed, nudge)
+    if not (emulator.processor.noise or nudge_of(emulator, nudge)):
+        for part in stream_rollout(emulator, state, frames, monitor, prescribed):
+            yield Rollout.stack([part] * members)
+        return
+    scenes = len(state.position)
+    batches = _batches(emulator, members * scenes)
+    monitors = [monitor and dataclasses.replace(monitor, first_scene=rows.start) for rows in batches]
+    streams = [
+        stream_rollout(
+            emulator,
+            starts.scenes(slice(rows.start, rows.stop)),
+            frames,
+            watch,
+            prescribed and _rows_of(prescribed, [row % scenes for row in rows]),
+            Noise(emulator, [int(_sequence(seed, row, scenes).generate_state(1, np.uint64)[0]) for row in rows]),
+        )
+        for rows, watch in zip(batches, monitors, strict=True)
+    ]
+    try:
+        for parts in zip(*streams, strict=True):
+            yield Rollout.stack(parts)
+    finally:
+        if monitor is not None:
+            monitor.gather([watch for watch in monitors if watch is not None])
+
+
+@torch.no_grad()
+def member_starts(
+    emulator: Emulator, state: Particles, members: int, seed: int = 0, nudge: float | None = None
+) -> Particles:
+    """The states (M·B, …) that members start from, rows 0 … B - 1 those of member 0.
+
+    Positions are displaced by Gaussian numbers, but for particles that this would take out of the bounds or into an
+    obstacle; velocities stay.
+
+    Args:
+        emulator: Whose cells, bounds and obstacles count.
+        state: Of B scenes.
+        members: M.
+        seed: Of the displacements.
+        nudge: Standard deviation of the displacements in cells; when left out `NUDGE`, or 0 for emulators that read
+            noise.
+
+    Raises:
+        ConfigError: if `members`, `seed` or `nudge` is too small.
+    """
+    check_members(members, seed, nudge)
+    scenes, size = len(state.position), nudge_of(emulator, nudge)
+    starts = state.scenes(list(range(scenes)) * members)
+    if not size:
+        return starts
+    shift = torch.zeros(starts.position.shape, dtype=torch.float64)
+    for row, real in enumerate(starts.mask.cpu()):
+        drawn = np.random.default_rng(_sequence(seed, row, scenes)).standard_normal((int(real.sum()), shift.shape[2]))
+        shift[row, real] = torch.from_numpy(drawn)
+    spacing = starts.position.new_tensor(emulator.grid.spacing)
+    moved = starts.with_motion(starts.position + size * spacing * shift.to(starts.position), starts.velocity)
+    free = _is_free(emulator, moved).unsqueeze(-1)
+    return moved.with_motion(torch.where(free, moved.position, starts.position), starts.velocity)
+
+
+def nudge_of(emulator: Emulator, nudge: float | None) -> float:
+    """The nudge in cells that is stated, or the default: 0 where the processor reads noise."""
+    default = 0.0 if emulator.processor.noise else NUDGE
+    return default if nudge is None else nudge
+
+
+def _is_free(emulator: Emulator, state: Particles) -> Tensor:
+    """(B, N) bool: whether particles are within the bounds, and outside of obstacles."""
+    scene = emulator.scene
+    within = distance_beyond(state.position, scene.bounds, [not wraps for wraps in scene.periodic]) <= 0
+    if not (scene.obstacles and state.obstacle.shape[1]):
+        return within
+    share = obstacle_share(emulator.solid(state), emulator.walls)
+    return within & ~Contact(share, emulator.grid).inside(emulator.in_cells(state)[0])
+
+
+def _batches(emulator: Emulator, rows: int) -> list[range]:
+    """The rows of each batch, about as many in all."""
+    most = max(1, MOST_CELLS // emulator.grid.size)
+    if emulator.device.type == "cpu":
+        most = min(most, MOST_SCENES)
+    count = -(-rows // most)
+    return [range(rows * part // count, rows * (part + 1) // count) for part in range(count)]
+
+
+def _sequence(seed: int, row: int, scenes: int) -> np.random.SeedSequence:
+    """The random state of a row of M·B: of its member of its scene."""
+    return np.random.SeedSequence((seed, *divmod(row, scenes)))
+
+
+def _rows_of(prescribed: Prescribed, scenes: Sequence[int]) -> Prescribed:
+    """What is prescribed in some of the scenes, the same one repeatedly."""
+
+    def pick(values: Tensor) -> Tensor:
+        return values.expand(len(scenes), *values.shape[1:]) if len(values) == 1 else values[list(scenes)]
+
+    return prescribed.map(pick)
