@@ -228,3 +228,27 @@ def test_graph_networks_have_all_near_pairs_and_do_not_depend_on_place_and_order
     expected = simulator.advance(history, around)
     torch.testing.assert_close(simulator.advance(history[order], around), expected[order], atol=1e-5, rtol=0)
     torch.testing.assert_close(simulator.advance(history + shift, around), expected + shift, atol=1e-5, rtol=0)
+
+
+def test_ensembles_are_scored_beside_those_of_the_simulator(tmp_path):
+    generate(
+        load_preset("waterramps").with_frames(12), tmp_path / "data", {"train": 0, "valid": 0, "test": 2}, workers=1
+    )
+    words = [
+        "--models",
+        "waterramps:one",
+        "waterramps:0.1",
+        "--members",
+        "2",
+        "--frames",
+        "4",
+        "--simulator-scenes",
+        "1",
+    ]
+    written = run_script("ensembles", str(tmp_path / "data"), *words, "--out", str(tmp_path / "out"))
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "ensembles.json", "ensembles.md", "members.png", "ranks.png",
+    }  # fmt: skip
+    scores = json.loads((tmp_path / "out" / "ensembles.json").read_text())["scenes"]
+    assert [len(rows) for rows in scores.values()] == [2, 2, 1]
+    assert "Fair CRPS of the density, over that of waterramps:one" in written
