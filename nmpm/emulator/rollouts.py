@@ -128,10 +128,12 @@ class Rollout(NamedTuple):
     Args:
         position: (B, T, N, D) in domain length.
         fields: (B, T, N) of each evolving field, by name, in its own unit.
+        trusted: (B,) frames up to which each scene is trusted; None where that was not asked for.
     """
 
     position: Tensor
     fields: Mapping[str, Tensor]
+    trusted: Tensor | None = None
 
     @classmethod
     def join(cls, parts: Sequence[Rollout]) -> Rollout:

@@ -19,7 +19,7 @@ from nmpm._support.plain_data import from_plain, to_plain
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval, Scene
 from nmpm.sim.blocks import Layout
-from nmpm.sim.state import InitialState, Progress, SimulatedTrajectory, check, check_numbers
+from nmpm.sim.state import Array, InitialState, Obstacle, Progress, SimulatedTrajectory, check, check_numbers
 
 BOUNDARY = 3
 """Type id of particles that never move, as in DeepMind's scenes."""
@@ -97,6 +97,21 @@ class Preset(abc.ABC):
                 an obstacle.
             UnstableError: if the simulation becomes unstable; the message names the frame.
         """
+
+    def obstacles_from(self, particles: Array) -> tuple[Obstacle, ...]:
+        """The obstacles that particles (M, D) which do not move fill, as trajectories hold them; the box has its walls.
+
+        Raises:
+            ConfigError: if there are some within the box that cannot be told from their particles.
+        """
+        low, high = np.array(self.box).T
+        inside = ((particles > low) & (particles < high)).all(axis=1)
+        if inside.any():
+            raise ConfigError(
+                f"The preset {self.name} cannot tell obstacles from their {int(inside.sum())} particles in the box, the"
+                f" first at {particles[inside][0].round(3).tolist()}; it goes on from scenes without obstacles alone."
+            )
+        return ()
 
     def simulate(self, seed: int, progress: Progress | None = None) -> SimulatedTrajectory:
         """A trajectory of `self.frames` + 1 frames; the same preset and seed give the same bits.

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from numpy.typing import ArrayLike
@@ -19,17 +19,16 @@ from torch import Tensor
 
 from nmpm._support.devices import find_device
 from nmpm.data.format import Trajectory
-from nmpm.emulator import NETWORK_PRECISIONS, Emulator, Prescribed, Rollout, differentiable_rollout, predict_rollout
-from nmpm.emulator.input_checks import warn_of_start_outside
-from nmpm.emulator.members import nudge_of, predict_members
+from nmpm.emulator import NETWORK_PRECISIONS
 from nmpm.emulator.runtimes import Runtime
 from nmpm.emulator.similarity import Match
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
-from nmpm.zoo.card import preset_of, stated_nudge
+from nmpm.zoo.card import preset_of
 from nmpm.zoo.matching import match_data
 from nmpm.zoo.optimization import AUTO, optimize, small_example
+from nmpm.zoo.predictor import Predictor
 from nmpm.zoo.starts import state_of, thrown_state
 from nmpm.zoo.states import TOO_FAST, Bodies, StateBuilder
 
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Pretrained:
+class Pretrained(Predictor):
     """A trained model, ready to roll out or to fine-tune.
 
     Args:
@@ -48,8 +47,6 @@ class Pretrained:
         match: How the emulator takes foreign data, once `fit_to` has made it do so.
     """
 
-    emulator: Emulator
-    card: Mapping[str, Any]
     match: Match | None = None
 
     def __repr__(self) -> str:
@@ -243,57 +240,3 @@ class Pretrained:
         if target.type == self.emulator.device.type and target.index in (None, self.emulator.device.index):
             return self
         return dataclasses.replace(self, emulator=copy.deepcopy(self.emulator).to(target))
-
-    @property
-    def nudge(self) -> float:
-        """Standard deviation of the displacements of members' starts, in cells: the card's, else the emulator's."""
-        stated = stated_nudge(self.card)
-        return nudge_of(self.emulator, None) if stated is None else stated
-
-    def rollout(
-        self, state: Particles, frames: int, prescribed: Prescribed | None = None,
-        members: int | None = None, seed: int = 0, nudge: float | None = None,
-    ) -> Tensor:  # fmt: skip
-        """Predict positions (B, frames, N, D) in domain length from a state, whose own frame is not among them.
-
-        Args:
-            state: From `state`, or a window's `initial`; several of any size at once by `Particles.stack`.
-            frames: How many.
-            prescribed: Obstacles that move, `Prescribed.obstacles(positions)`, or particles that enter and leave too,
-                `Prescribed.of(window)`. Positions of particles that are not there are NaN, as are those of particles
-                that have left through an open axis.
-            members: So many rollouts of each scene, (M, B, frames, N, D), see `nmpm.emulator.members`: by the noise
-                that the model was trained with, or else from nudged starts. None for one, (B, frames, N, D).
-            seed: Of members: each depends on it, its number and its scene, not on how many there are.
-            nudge: Standard deviation of the displacements of members' starts in cells; `model.nudge` if left out.
-
-        Raises:
-            ConfigError: if a number is too small, or a nudge is given without members.
-
-        Warns:
-            UserWarning: if particles start outside of the bounds, into which the first frame moves them.
-        """
-        return self.predict(state, frames, prescribed, members, seed, nudge).position
-
-    def predict(
-        self, state: Particles, frames: int, prescribed: Prescribed | None = None,
-        members: int | None = None, seed: int = 0, nudge: float | None = None,
-    ) -> Rollout:  # fmt: skip
-        """As `rollout`, with the evolving fields of the particles, such as a temperature, beside their positions."""
-        there, given = state.to(self.emulator.device), prescribed and prescribed.to(self.emulator.device)
-        warn_of_start_outside(self.emulator, there)
-        if members is not None:
-            size = self.nudge if nudge is None else nudge
-            return predict_members(self.emulator, there, frames, members, seed, size, given)
-        if nudge is not None:
-            raise ConfigError(f"nudge = {nudge!r} displaces the starts of members: give members=8, too.")
-        return predict_rollout(self.emulator, there, frames, prescribed=given)
-
-    def differentiable_rollout(self, state: Particles, frames: int) -> Tensor:
-        """As `rollout`, with gradients to the state, see `nmpm.emulator.differentiable_rollout`.
-
-        Memory grows by one state per bundle; backward passes compute each bundle again.
-        """
-        there = state.to(self.emulator.device)
-        warn_of_start_outside(self.emulator, there)
-        return differentiable_rollout(self.emulator, there, frames)

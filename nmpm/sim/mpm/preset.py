@@ -15,6 +15,7 @@ from nmpm._support.plain_data import from_plain, to_plain
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval, Scene
 from nmpm.sim.blocks import Layout
+from nmpm.sim.mpm.fitted_ramps import fit_ramps
 from nmpm.sim.mpm.layouts import MpmBlockRanges, RampRanges, SimulatedRamp, distance_to_ramps
 from nmpm.sim.mpm.material import Material
 from nmpm.sim.mpm.obstacle_field import ObstacleField
@@ -29,7 +30,16 @@ from nmpm.sim.mpm.stability import (
 from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, MpmStepper, Walls
 from nmpm.sim.mpm.water import Water
 from nmpm.sim.preset import BOUNDARY, Preset
-from nmpm.sim.state import Array, InitialState, Progress, SimulatedTrajectory, check, check_numbers, record_frames
+from nmpm.sim.state import (
+    Array,
+    InitialState,
+    Obstacle,
+    Progress,
+    SimulatedTrajectory,
+    check,
+    check_numbers,
+    record_frames,
+)
 
 MATERIALS: dict[str, type[Material]] = {kind.name: kind for kind in (Water, Sand, Goop)}
 """The constitutive models by name; a new one is added here."""
@@ -198,6 +208,11 @@ class MpmPreset(Preset):
         if self.gravity_turn:
             attributes["gravity"] = np.array(gravity)
         return SimulatedTrajectory(position, particle_type, attributes)
+
+    def obstacles_from(self, particles: Array) -> tuple[Obstacle, ...]:
+        if self.ramps is None or self.dim != 2:
+            return super().obstacles_from(particles)
+        return fit_ramps(particles, self.ramps.thickness, self.spacing) if len(particles) else ()
 
     def _grid(self, gravity: tuple[float, ...], ramps: tuple[SimulatedRamp, ...]) -> MpmGrid:
         low, high = np.array(self.reach).T

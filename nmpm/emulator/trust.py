@@ -1,0 +1,260 @@
+"""Trust: up to which frame a rollout predicts this scene, and not just one like it.
+
+After some time a splash is chaos: rollouts whose starts differ by a tenth of a cell part, and where they do, the
+prediction and what happens part likewise. Two sets of positions *disagree* by the share of the material that one has in
+other cells than the other, cells of 3 particle spacings: 0 for the same field, 1 for none in common. Which particle is
+where does not matter. A rollout is *trusted* until the mean disagreement of its members passes a limit, which is
+calibrated on validation scenes: there, the first frame beyond it and the first frame at which the rollout disagrees by
+a tenth with the recorded scene are, on average, the same.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from nmpm._support.numbers import is_finite
+from nmpm.emulator.members import stream_members
+from nmpm.emulator.model import Emulator
+from nmpm.emulator.monitor import Monitor
+from nmpm.emulator.prescribed import Prescribed
+from nmpm.emulator.rollouts import Rollout, stream_rollout
+from nmpm.errors import DataError
+from nmpm.grid import Grid
+from nmpm.particles import Particles, Window
+from nmpm.scene import Scene
+from nmpm.transfer import Linear
+
+COMPANIONS = 2
+"""Nudged rollouts with which a single one is compared."""
+ERROR = 0.1
+"""Disagreement with the recorded scene that ends trust."""
+_CELL = 3.0  # particle spacings: side of the cells in which material is counted
+_REGION = 4  # cells along each side of a region
+_LIMITS = torch.logspace(-2, 0, 140).tolist()
+_WITHIN = 0.68  # share of the validation scenes within the stated error
+
+
+@dataclass(frozen=True)
+class Trust:
+    """When members disagree so much that a rollout is one of many.
+
+    Args:
+        limit: Mean disagreement of members beyond which a rollout is not trusted.
+        error: Error of the trusted frame as a share of it, that 68% of the validation scenes are within.
+        scenes: Validation scenes of the calibration; 0 where there was none, and limit and error are `waterramps`'.
+    """
+
+    limit: float = 0.057
+    error: float = 0.2
+    scenes: int = 0
+
+    @classmethod
+    def from_card(cls, section: Any) -> Self:
+        """What the section `trust` of a card states; the defaults where there is none, or it makes no sense."""
+        stated = section if isinstance(section, Mapping) else {}
+        if not all(is_finite(stated.get(name)) and stated[name] > 0 for name in ("limit", "error")):
+            return cls()
+        return cls(float(stated["limit"]), float(stated["error"]), int(stated.get("scenes") or 0))
+
+    @classmethod
+    def fit(cls, members: Sequence[Tensor], truth: Sequence[Tensor]) -> Self:
+        """The limit by which trusted frames are nearest to the true ones, in the mean of the logarithms' distance.
+
+        Where several are equally near, as where no scene is ever lost, the one nearest to the default.
+
+        Args:
+            members: Of each scene, (T,) disagreement of the members in each frame.
+            truth: Of each scene, (T,) disagreement of the prediction with the recorded scene.
+
+        Raises:
+            DataError: if there is no scene.
+        """
+        if not members:
+            raise DataError("Trust is calibrated on one recorded scene or more, and there is none.")
+        right = torch.tensor([max(1, frames_below(curve, ERROR)) for curve in truth], dtype=torch.float64)
+        distances = {limit: (_frames(members, limit) / right).log().abs().mean().item() for limit in _LIMITS}
+        least = min(distances.values()) + 1e-9
+        limit = min((one for one in _LIMITS if distances[one] <= least), key=lambda one: abs(one - cls.limit))
+        errors = (_frames(members, limit) / right - 1).abs()
+        return cls(round(limit, 4), round(max(0.01, float(errors.quantile(_WITHIN))), 3), len(members))
+
+    def to_card(self) -> dict[str, Any]:
+        """The section `trust` of a card."""
+        return dataclasses.asdict(self)
+
+    def line(self, frame: int, frames: int) -> str:
+        """A sentence about a rollout of so many frames, trusted up to a frame."""
+        kind = "" if self.scenes else " (the limit is waterramps'; this model's is not calibrated)"
+        if frame >= frames:
+            return f"Trusted for all {frames} frames: members disagree about less than {self.limit:.1%}{kind}."
+        return f"Beyond frame {frame} ± {max(1, round(self.error * frame))} this scene is one of many{kind}."
+
+
+def _frames(curves: Sequence[Tensor], limit: float) -> Tensor:
+    return torch.tensor([max(1, frames_below(curve, limit)) for curve in curves], dtype=torch.float64)
+
+
+def frames_below(curve: Tensor, limit: float) -> int:
+    """How many frames of a curve (T,) come before the first that is beyond a limit."""
+    beyond = (curve > limit).nonzero()
+    return int(beyond[0]) if len(beyond) else len(curve)
+
+
+class TrustTracker:
+    """Watches members of the rollouts of B scenes as they are made.
+
+    Args:
+        scene: The facts of the scenes.
+        state: That the rollouts start from.
+        trust: The limit.
+
+    Attributes:
+        made: Frames seen.
+        frames: (B,) int64, frames up to which each scene is trusted.
+        regions: (B, *R) int64, likewise of each region of 4³ or 4² cells, by the material that it holds in both.
+    """
+
+    def __init__(self, scene: Scene, state: Particles, trust: Trust) -> None:
+        self.trust, self.made = trust, 0
+        self._scene, self._grid = scene, _counting_grid(scene)
+        self._values = functional.one_hot(state.material, len(scene.materials)) * state.present_volume.unsqueeze(-1)
+        self._values = self._values.to(torch.float32)
+        self.frames = torch.zeros(len(state.position), dtype=torch.int64)
+        self._lost = torch.zeros(len(state.position), dtype=torch.bool)
+        shape = tuple(-(-cells // _REGION) for cells in self._grid.shape)
+        self.regions = torch.zeros(len(state.position), *shape, dtype=torch.int64)
+        self._lost_regions = torch.zeros_like(self.regions, dtype=torch.bool)
+        self._curves: list[Tensor] = []
+
+    @property
+    def curve(self) -> Tensor:
+        """(B, T) mean disagreement of the members in each frame seen."""
+        return torch.cat(self._curves, dim=1)
+
+    def see(self, members: Tensor) -> None:
+        """Take in the next frames of M members, (M, B, T, N, D)."""
+        apart, total = self._differences(members)
+        curve = (apart.flatten(2).sum(2) / total.flatten(2).sum(2).clamp(min=1e-12)).cpu()
+        regions = self._by_region(apart, total).cpu()
+        for frame in range(curve.shape[1]):
+            self._lost |= curve[:, frame] > self.trust.limit
+            self._lost_regions |= regions[:, frame] > self.trust.limit
+            self.frames += ~self._lost
+            self.regions += ~self._lost_regions
+        self.made += curve.shape[1]
+        self._curves.append(curve)
+
+    def _differences(self, members: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, T, *S) mean over pairs of the members of |a - b| and of a + b, a the material in a cell of one."""
+        count, batch, frames = members.shape[:3]
+        there = members.isfinite().all(-1)
+        values = self._values[:, None] * there.unsqueeze(-1)
+        rows = members.nan_to_num().flatten(0, 2)
+        fields = Linear().p2g(values.flatten(0, 2), self._grid.to_cells(rows), self._grid)
+        fields = fields.view(count, batch, frames, -1, *self._grid.shape)
+        rank = torch.arange(1 - count, count, 2, dtype=fields.dtype, device=fields.device)  # Σ_{i<j} |x_i - x_j|
+        apart = torch.tensordot(rank, fields.sort(dim=0).values, dims=1) / (count * (count - 1) / 2)
+        return apart.sum(2), 2 * fields.mean(0).sum(2)
+
+    def _by_region(self, apart: Tensor, total: Tensor) -> Tensor:
+        """(B, T, *R) disagreement in each region; 0 where it holds less than a cell full of material."""
+        sums = [_sum_blocks(values, self._grid.dim) for values in (apart, total)]
+        full = 2 * self._grid.cell_volume / self._scene.particle_volume
+        return torch.where(sums[1] > full, sums[0] / sums[1].clamp(min=full), 0.0)
+
+    def report(self) -> str:
+        """A sentence about each scene, see `Trust.line`; one about the first to be lost where there are several."""
+        return self.trust.line(int(self.frames.min()), self.made)
+
+
+def _sum_blocks(values: Tensor, dim: int) -> Tensor:
+    """Sums (B, T, *R) over blocks of `_REGION` cells along each of the last axes of (B, T, *S)."""
+    for axis in range(-dim, 0):
+        padding = [0, 0] * (-axis - 1) + [0, -values.shape[axis] % _REGION]
+        values = functional.pad(values, padding).unflatten(axis, (-1, _REGION)).sum(axis)
+    return values
+
+
+def _counting_grid(scene: Scene) -> Grid:
+    longest = max(high - low for low, high in scene.domain)
+    return Grid.of(scene, max(1, round(longest / (_CELL * scene.particle_spacing))))
+
+
+def stream_watched(
+    emulator: Emulator,
+    state: Particles,
+    frames: int,
+    tracker: TrustTracker,
+    members: int | None = None,
+    seed: int = 0,
+    nudge: float | None = None,
+    prescribed: Prescribed | None = None,
+    monitor: Monitor | None = None,
+) -> Iterator[Rollout]:
+    """Predict as `stream_rollout`, or as `stream_members`, while a tracker watches how far the rollouts part.
+
+    A single rollout, of which nothing changes, is compared with `COMPANIONS` that start nearby: three cost about three
+    times as much. Of members, at least 2, each is compared with each.
+    """
+    scenes = len(state.position)
+    if members is not None and members > 1:
+        for part in stream_members(emulator, state, frames, members, seed, nudge, prescribed, monitor):
+            tracker.see(part.position.unflatten(0, (members, scenes)))
+            yield part
+        return
+    if members is None:
+        single = stream_rollout(emulator, state, frames, monitor, prescribed)
+    else:
+        single = stream_members(emulator, state, frames, 1, seed, nudge, prescribed, monitor)
+    others = stream_members(emulator, state, frames, COMPANIONS, seed + 1, nudge, prescribed)
+    for part, beside in zip(single, others, strict=True):
+        tracker.see(torch.cat([part.position, beside.position]).unflatten(0, (1 + COMPANIONS, scenes)))
+        yield part
+
+
+def until_trusted(parts: Iterator[Rollout], tracker: TrustTracker) -> Iterator[Rollout]:
+    """The frames of `stream_watched` that are trusted, up to the last one of any scene.
+
+    Positions and fields of a scene that is lost earlier than others of its batch are NaN from then on.
+    """
+    made = 0
+    for part in parts:
+        kept = int(tracker.frames.max()) - made
+        index = torch.arange(made + 1, tracker.made + 1)
+        there = (index <= tracker.frames[:, None]).repeat(len(part.position) // len(tracker.frames), 1)
+        yield _masked(part, there.to(part.position.device), kept)
+        made = tracker.made
+        if kept < len(index):
+            return
+
+
+def _masked(part: Rollout, there: Tensor, kept: int) -> Rollout:
+    """The first frames of a part, NaN where `there` (rows, T) is False."""
+    position = torch.where(there[:, :, None, None], part.position, torch.nan)[:, :kept]
+    fields = {name: torch.where(there[..., None], values, torch.nan)[:, :kept] for name, values in part.fields.items()}
+    return Rollout(position, fields)
+
+
+def calibrate(emulator: Emulator, windows: Iterator[Window]) -> Trust:
+    """The trust of an emulator on recorded scenes, each the only one of a window.
+
+    Raises:
+        DataError: if there is none.
+    """
+    members, truth = [], []
+    for window in windows:
+        state, frames = window.initial, window.target.shape[1]
+        beside, apart = (TrustTracker(emulator.scene, state, Trust()) for _ in range(2))
+        for part in stream_watched(emulator, state, frames, beside):
+            recorded = window.target[:, apart.made : beside.made]
+            apart.see(torch.stack([part.position, recorded.to(part.position)]))
+        members.append(beside.curve[0])
+        truth.append(apart.curve[0])
+    return Trust.fit(members, truth)

@@ -1,0 +1,169 @@
+"""Rollouts up to the last trusted frame, and from there on by a simulator.
+
+An emulator knows positions and velocities alone. A simulator that goes on from its last trusted frame takes these, and
+starts without strain and pressure: deformation gradients are the identity, densities those at rest. What was compressed
+or sheared until then has forgotten it, as if it had just been put there.
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from nmpm._support.numbers import check_whole
+from nmpm.emulator import Emulator, Prescribed, Rollout
+from nmpm.emulator.trust import Trust, TrustTracker, stream_watched, until_trusted
+from nmpm.errors import ConfigError, UnstableError
+from nmpm.particles import Particles
+from nmpm.scene import Interval, Scene
+from nmpm.sim import InitialState, Preset
+from nmpm.sim.mpm.mixture import MpmMixture
+from nmpm.sim.state import Array
+
+_SAME = 1e-3
+"""Relative difference up to which lengths, volumes and times of model and preset are the same."""
+_LONGEST_RATIO = 64
+"""Largest denominator of the ratio between the frames of model and preset."""
+
+
+def predict_trusted(
+    emulator: Emulator,
+    trust: Trust,
+    state: Particles,
+    frames: int,
+    prescribed: Prescribed | None = None,
+    members: int | None = None,
+    seed: int = 0,
+    nudge: float | None = None,
+) -> Rollout:
+    """Predict as `predict_rollout`, or `predict_members`, up to the last trusted frame of any scene.
+
+    Positions of scenes that are lost before others are NaN from then on; `trusted` (B,) says when.
+    """
+    check_whole("frames", frames, 1)
+    tracker = TrustTracker(emulator.scene, state, trust)
+    watched = stream_watched(emulator, state, frames, tracker, members, seed, nudge, prescribed)
+    made = Rollout.join(list(until_trusted(watched, tracker)))._replace(trusted=tracker.frames)
+    if members is None:
+        return made
+    fields = {name: values.unflatten(0, (members, -1)) for name, values in made.fields.items()}
+    return made._replace(position=made.position.unflatten(0, (members, -1)), fields=fields)
+
+
+def predict_and_simulate(
+    emulator: Emulator, trust: Trust, state: Particles, frames: int, preset: Preset, nudge: float | None = None
+) -> Rollout:
+    """Predict up to each scene's last trusted frame, `trusted` (B,), and simulate the rest by a preset."""
+    preset = fitting_preset(emulator.scene, state, preset)
+    trusted = predict_trusted(emulator, trust, state, frames, nudge=nudge)
+    return simulate_rest(emulator.scene, state, trusted, preset, frames)
+
+
+def simulate_rest(scene: Scene, state: Particles, rollout: Rollout, preset: Preset, frames: int) -> Rollout:
+    """All of so many frames, those that are not trusted simulated by a preset.
+
+    Args:
+        scene: The model's, which fits the preset.
+        state: That the rollout started from.
+        rollout: From `predict_trusted`.
+        preset: The simulator.
+        frames: How many in all.
+
+    Raises:
+        UnstableError: if a simulation becomes unstable.
+    """
+    batch, made, *rest = rollout.position.shape
+    position = rollout.position.new_full((batch, frames, *rest), torch.nan)
+    position[:, :made] = rollout.position
+    for index, last in enumerate([made] * batch if rollout.trusted is None else rollout.trusted.tolist()):
+        if last < frames:
+            path = torch.cat([state.position[index, None], position[index, :last]])
+            velocity = state.velocity[index] if last == 0 else path[-1] - path[-2]
+            start = state.scenes([index]).with_motion(path[-1:], velocity[None].to(path))
+            position[index, last:] = simulate_on(scene, start, preset, frames - last).to(position)
+    return Rollout(position, {}, rollout.trusted)
+
+
+def fitting_preset(scene: Scene, state: Particles, preset: Preset) -> Preset:
+    """The preset with the frames of a model's scene, from whose state it shall go on.
+
+    Raises:
+        ConfigError: naming what differs: a material, the bounds, the volume of particles, what the simulator lacks; or
+            obstacles that cannot be told from their particles.
+    """
+    theirs = preset.scene
+    unknown = [name for name in scene.materials if name not in theirs.materials]
+    side = max(high - low for low, high in theirs.bounds)
+    differences = {
+        f"it simulates {', '.join(theirs.materials)}, not {', '.join(unknown)}": bool(unknown),
+        f"its bounds are {theirs.bounds}, the model's {scene.bounds}": not _are_near(scene.bounds, theirs.bounds, side),
+        f"its axes are {theirs.boundary}, the model's {scene.boundary}": scene.boundary != theirs.boundary,
+        f"its particles have the volume {theirs.particle_volume:g}, the model's {scene.particle_volume:g}": (
+            not math.isclose(scene.particle_volume, theirs.particle_volume, rel_tol=_SAME)
+        ),
+        "its particles are all of one size": not _are_of_one_size(state),
+        f"it has no {', '.join(scene.fields)}": bool(scene.fields),
+        "its obstacles do not move": scene.moving_obstacles,
+        "it simulates only states that it has drawn": isinstance(preset, MpmMixture),
+    }
+    for difference, differs in differences.items():
+        if differs:
+            raise ConfigError(f"fallback: the preset {preset.name} is of other scenes than the model's: {difference}.")
+    for index in range(len(state.position)):
+        preset.obstacles_from(_obstacle(state, index))
+    ratio = scene.dt / preset.frame_dt
+    if math.isclose(ratio, 1.0, rel_tol=_SAME):
+        return preset
+    return preset.with_stride(Fraction(ratio).limit_denominator(_LONGEST_RATIO))
+
+
+def _are_near(ours: tuple[Interval, ...], theirs: tuple[Interval, ...], side: float) -> bool:
+    return len(ours) == len(theirs) and np.allclose(ours, theirs, rtol=0, atol=_SAME * side)
+
+
+def _are_of_one_size(state: Particles) -> bool:
+    return state.volume is None or bool((state.volume[state.mask] == 1).all())
+
+
+def _obstacle(state: Particles, index: int) -> Array:
+    """(M, D) obstacle particles of a scene of the batch."""
+    return state.obstacle[index, state.obstacle_mask[index]].cpu().double().numpy()
+
+
+def simulate_on(scene: Scene, state: Particles, preset: Preset, frames: int) -> Tensor:
+    """(frames, N, D) positions that a preset makes of the only scene of a state, whose own frame is not among them.
+
+    Positions and velocities are the state's, strain and pressure start anew. Padding is NaN.
+
+    Raises:
+        UnstableError: if the simulation becomes unstable.
+    """
+    start, order = _initial_state(scene, state, preset)
+    try:
+        made = preset.simulate_from(start, frames).position[1:, : len(order)]
+    except UnstableError as error:
+        raise UnstableError(f"fallback: {preset.name}, from the last trusted frame on: {error}") from error
+    simulated = torch.full((frames, *state.position.shape[1:]), torch.nan)
+    simulated[:, state.mask[0].cpu().nonzero()[:, 0][torch.from_numpy(order)]] = torch.from_numpy(made)
+    return simulated
+
+
+def _initial_state(scene: Scene, state: Particles, preset: Preset) -> tuple[InitialState, NDArray[np.int64]]:
+    """What the simulator starts from, and the state's particles in the simulator's order, by material."""
+    real, names = state.mask[0].cpu().numpy(), preset.scene.materials
+    kinds = np.array([names.index(name) for name in scene.materials])[state.material[0].cpu().numpy()[real]]
+    order = np.argsort(kinds, kind="stable")
+    position, velocity = (
+        values[0].detach().cpu().double().numpy()[real][order] for values in (state.position, state.velocity)
+    )
+    low, high = np.array(preset.reach).T
+    gravity = tuple((state.gravity[0].double() / scene.dt**2).tolist()) if scene.gravity_known else None
+    counts = tuple(np.bincount(kinds, minlength=len(names)).tolist())
+    obstacles = preset.obstacles_from(_obstacle(state, 0))
+    # (beyond the simulator's walls by rounding alone)
+    return InitialState(np.clip(position, low, high), velocity / scene.dt, gravity, counts, obstacles), order
