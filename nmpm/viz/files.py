@@ -71,6 +71,7 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
         fields={name: {label: values[:frames, moving]} for name, values in fields.items() if values.shape[1] > 1},
         prescribed=frozenset(names[number] for number in prescribed),
         further_members={name: position[:frames, moving] for name, position in others.items()},
+        densities=dict(zip(scene.materials, scene.densities, strict=False)),
     )
 
 

@@ -1,6 +1,7 @@
 """Numbers derived from the positions of all particles, frame by frame, and the bands that an ensemble's members fill.
 
-The quantities are those of `nmpm.metrics.quantities`, for pictures without torch; all particles count alike.
+Front, mean height and kinetic energy are as in `nmpm.metrics.quantities`, without torch and for all frames at once; the
+particles have one volume.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm.viz.camera import box_corners, vertical_axis
+from nmpm.viz.camera import box_corners
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
 FRONT = 0.95
@@ -42,10 +43,10 @@ class QuantityCurves:
 
 
 def quantity_curves(trajectories: LabelledTrajectories) -> list[QuantityCurves]:
-    """Mean height, front and kinetic energy of an ensemble's members, and with a truth their errors against it."""
+    """Mean height (with gravity), front and kinetic energy of an ensemble's members; their errors where truth is."""
     members, truth = list(trajectories.members.values()), trajectories.truth
     quantities = {
-        "mean height (length)": mean_height,
+        **({"mean height (length)": mean_height} if _down(trajectories).any() else {}),
         "front (length)": front,
         "kinetic energy (length²/s²)": kinetic_energy,
     }
@@ -67,13 +68,13 @@ def mean_height(trajectories: LabelledTrajectories, position: Floats) -> Curve:
     """Mean height (T,) above the lowest bound against gravity, of positions (T, N, D); 0 where no particle is."""
     up = -_down(trajectories)
     heights = trajectories.wrap(position[:, trajectories.predicted]) @ up
-    return _mean(heights - (box_corners(trajectories.bounds) @ up).min())
+    return _mean(heights - (box_corners(trajectories.bounds) @ up).min(), np.ones(heights.shape[1]))
 
 
 def front(trajectories: LabelledTrajectories, position: Floats) -> Curve:
     """How far the particles have advanced, (T,): the distance across gravity that 95% of them are within.
 
-    It counts from their mean position in the first frame; 0 where no particle is.
+    It counts from their mean position in the first frame, in all directions without gravity; 0 where no particle is.
     """
     position, down = position[:, trajectories.predicted], _down(trajectories)
     offset = position - np.nanmean(position[0].astype(np.float64), axis=0)
@@ -88,29 +89,27 @@ def front(trajectories: LabelledTrajectories, position: Floats) -> Curve:
 
 
 def kinetic_energy(trajectories: LabelledTrajectories, position: Floats) -> Curve:
-    """Kinetic energy per mass (T,), in length² per second², of the motion from each frame to the next.
+    """Kinetic energy per mass (T,), in length² per second², of the motion from the frame before.
 
-    The last frame has that of the frame before.
+    The first frame has that of the second; 0 where no particle is.
     """
-    position = position[:, trajectories.predicted].astype(np.float64)
-    if len(position) < 2:
-        return np.zeros(len(position))
-    squares = np.zeros((len(position) - 1, position.shape[1]))
+    moving = trajectories.predicted
+    squares = np.zeros((max(len(position) - 1, 0), int(moving.sum())))
     for axis, period in enumerate(trajectories.periods):
-        step = np.diff(position[..., axis], axis=0)
+        step = np.diff(position[:, moving, axis].astype(np.float64), axis=0)
         squares += np.square(step - period * np.round(step / period) if period else step)
-    energy = _mean(squares) / (2 * trajectories.dt**2)
-    return np.append(energy, energy[-1])
+    mass = np.array([trajectories.densities.get(name, 1.0) for name in trajectories.material[moving].tolist()])
+    energy = _mean(squares, mass) / (2 * trajectories.dt**2)
+    return np.concatenate([energy[:1] if len(energy) else np.zeros(1), energy])
 
 
 def _down(trajectories: LabelledTrajectories) -> NDArray[np.float64]:
-    """(D,) unit vector along gravity; against the axis that is drawn vertically where it is zero or not known."""
+    """(D,) unit vector along gravity; zero where gravity is, or is not known."""
     gravity = np.array(trajectories.gravity or np.zeros(trajectories.dim), dtype=np.float64)
-    strength = float(np.linalg.norm(gravity))
-    return gravity / strength if strength else -np.eye(trajectories.dim)[vertical_axis(trajectories)]
+    return gravity / (float(np.linalg.norm(gravity)) or 1.0)
 
 
-def _mean(values: NDArray[np.float64]) -> Curve:
-    """Means (T,) over the particles that are there of values (T, N); 0 where none is."""
+def _mean(values: NDArray[np.float64], weight: NDArray[np.float64]) -> Curve:
+    """Weighted means (T,) over the particles that are there of values (T, N); 0 where none is."""
     there = ~np.isnan(values)
-    return np.asarray(np.where(there, values, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1))
+    return np.asarray((np.where(there, values, 0.0) @ weight) / np.maximum(there @ weight, 1e-300))

@@ -41,6 +41,7 @@ class LabelledTrajectories:
         prescribed: Names of materials that are not predicted, so that errors leave them out.
         further_members: Where the last of `positions` is a member of an ensemble: the others by label, (T, N, D) each.
             They are drawn behind it, and in bands of the share of members; positions are never averaged.
+        densities: Mass density by name of material, for kinetic energies; 1 where left out.
 
     Raises:
         DataError: if shapes do not match, or a position or a field is not finite; positions may be NaN on all axes.
@@ -58,6 +59,7 @@ class LabelledTrajectories:
     fields: Mapping[str, Mapping[str, Floats]] = field(default_factory=dict)
     prescribed: frozenset[str] = frozenset()
     further_members: Mapping[str, Floats] = field(default_factory=dict)
+    densities: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "material", np.asarray(self.material, dtype=np.str_))
@@ -98,6 +100,7 @@ class LabelledTrajectories:
             gravity=scene.gravity if gravity is None else tuple(gravity),
             title=title,
             fields=fields or {},
+            densities=dict(zip(scene.materials, scene.densities, strict=False)),
         )
 
     @property

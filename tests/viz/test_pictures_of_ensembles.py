@@ -4,11 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from nmpm.cli import main
 from nmpm.data.format import Split, write_metadata, write_split
 from nmpm.errors import DataError
+from nmpm.metrics import quantities
+from nmpm.scene import Scene
 from nmpm.viz import LabelledTrajectories
 from nmpm.viz.animation import FrameRenderer
 from nmpm.viz.files import combine, member_indices, read_labelled
@@ -35,7 +38,7 @@ def nudged(falling: LabelledTrajectories, count: int = 4, by: float = 0.02) -> L
     """The prediction with further members, each some way beside the one before."""
     shown = falling.positions["prediction"]
     further = {f"member {number}": shown + np.array([by * number, 0]) for number in range(1, count)}
-    return dataclasses.replace(falling, further_members=further)
+    return dataclasses.replace(falling, further_members=further, gravity=(0.0, -9.81))
 
 
 def test_members_of_one_start_are_read_as_one_ensemble(written):
@@ -73,9 +76,11 @@ def test_members_must_have_the_same_frames(falling):
 
 
 def test_quantities_have_closed_forms(falling):
+    floating, falling = falling, dataclasses.replace(falling, gravity=(0.0, -9.81))
     fall = falling.positions["simulation"]  # from 0.8 to 0.3 above a floor at 0.1
     np.testing.assert_allclose(mean_height(falling, fall), np.linspace(0.7, 0.2, 11))
     np.testing.assert_allclose(front(falling, fall), 0.2)
+    np.testing.assert_allclose(front(floating, fall), np.hypot(0.2, np.linspace(0, 0.5, 11)))
     np.testing.assert_allclose(kinetic_energy(falling, fall), (0.05 / 0.0025) ** 2 / 2)
     sideways = dataclasses.replace(falling, gravity=(9.81, 0.0))
     np.testing.assert_allclose(mean_height(sideways, fall), 0.4)
@@ -89,6 +94,22 @@ def test_quantities_have_closed_forms(falling):
     np.testing.assert_allclose(front(around, beyond), [0.2, *[0.3] * 10])
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_quantities_are_those_of_the_scores(dim):
+    rng = np.random.default_rng(dim)
+    gravity, dt = rng.normal(size=dim), 0.01
+    box = ((0.1, 0.9),) * dim
+    scene = Scene(box, box, dt, ("sand", "water"), 1e-4, gravity=tuple(gravity), densities=(1600.0, 1000.0))
+    path, material = rng.uniform(0.1, 0.9, size=(6, 20, dim)), rng.integers(2, size=20)
+    shown = LabelledTrajectories.from_scene(scene, {"prediction": path}, material)
+    states, kinds, pull, one = torch.tensor(path), torch.tensor(material), torch.tensor(gravity), torch.ones(20)
+    heights = quantities.mean_height(scene, states, pull[None], one[None])
+    np.testing.assert_allclose(mean_height(shown, path), heights)
+    np.testing.assert_allclose(front(shown, path), quantities.front(scene, states[0], states, pull, one.double()))
+    kinetic, _ = quantities.energies(scene, states, kinds, pull)
+    np.testing.assert_allclose(kinetic_energy(shown, path), torch.cat([kinetic[:1], kinetic]) / dt**2)
+
+
 def test_bands_are_quantiles_of_the_members(falling):
     ensemble = nudged(falling, count=7)
     heights, fronts, _, errors = quantity_curves(ensemble)
@@ -97,7 +118,7 @@ def test_bands_are_quantiles_of_the_members(falling):
         for share, (low, high) in curves.bands().items():
             np.testing.assert_array_equal(low, np.quantile(curves.members, (1 - share) / 2, axis=0))
             np.testing.assert_array_equal(high, np.quantile(curves.members, (1 + share) / 2, axis=0))
-    np.testing.assert_allclose(heights.truth, mean_height(falling, falling.positions["simulation"]))
+    np.testing.assert_allclose(heights.truth, mean_height(ensemble, falling.positions["simulation"]))
     np.testing.assert_allclose(errors.members[0], falling.rms_errors()["prediction"])
     alone = dataclasses.replace(ensemble, positions={"prediction": falling.positions["prediction"]})
     assert [curves.truth for curves in quantity_curves(alone)] == [None] * 3

@@ -152,3 +152,18 @@ def test_a_trajectory_is_shown_with_its_own_gravity(tmp_path):
     write_split(tmp_path / "out.h5", [wrong])
     with pytest.raises(DataError, match=r"out.h5, trajectory 0: the attribute gravity = .* should be 2 finite numbers"):
         view(tmp_path / "out.h5")
+
+
+def test_further_members_are_packed_coarsely_and_thinned_out_beyond_a_size(falling, monkeypatch):
+    shown = falling.positions["prediction"]
+    ensemble = dataclasses.replace(falling, further_members={"member 1": shown + 0.01})
+    page = description(view(ensemble))
+    low, high = np.array(page["low"]), np.array(page["high"])
+    steps = unpack(page["members"][0]["positions"], shown.shape)
+    assert np.all(np.abs(low + steps * (high - low) / 65535 - shown - 0.01) <= 16 * (high - low) / STEPS)
+    assert page["bands"]["stride"] == 1
+    assert len(page["curves"][0]["members"]) == 2
+    monkeypatch.setattr("nmpm.viz.viewer.page.MEMBER_BYTES", shown.size)  # half of what it takes
+    thinned = description(view(ensemble))
+    assert thinned["bands"]["stride"] == 2
+    np.testing.assert_array_equal(unpack(thinned["members"][0]["positions"], shown[:, ::2].shape), steps[:, ::2])

@@ -9,6 +9,8 @@ from PIL import Image
 
 from nmpm import view
 from nmpm.viz import LabelledTrajectories
+from nmpm.viz.occupancy import occupied_share
+from nmpm.viz.quantities import front
 from tests.conftest import wait_until
 
 WATER = (38, 112, 200)
@@ -121,3 +123,68 @@ def test_particles_have_the_colours_of_their_fields(open_page):
         rgb = [int(expected[at : at + 2], 16) for at in (1, 3, 5)]
         assert np.any(np.abs(left - rgb).sum(axis=2) < 12)
         assert np.any(np.abs(right - WATER).sum(axis=2) < 40)  # the prediction has no temperature
+
+
+def shown_ensemble(members=4, frames=6, dim=2):
+    """A truth, a member a little to the right of it, and further members that go on to the right."""
+    rng = np.random.default_rng(0)
+    truth = np.repeat(rng.uniform(0.2, 0.4, size=(1, 60, dim)), frames, axis=0)
+    along = np.eye(dim)[0] * np.linspace(0, 0.4, frames)[:, None, None]
+    further = {f"member {number}": truth + number / members * along for number in range(1, members)}
+    return LabelledTrajectories(
+        {"truth": truth, "member 0": truth + 0.001},
+        np.array(["water"] * 60),
+        bounds=((0.0, 1.0),) * dim,
+        dt=0.01,
+        further_members=further,
+        gravity=(0.0, -9.81, 0.0)[:dim],
+    )
+
+
+def test_an_ensemble_is_drawn_as_points_or_density_or_one_member(open_page):
+    ensemble = shown_ensemble()
+    page = open_page(ensemble)
+    page.keyboard.press("End")
+    pictures = {}
+    for mode in ("faint", "density", "0", "3"):
+        page.select_option("#members", mode)
+        pictures[mode] = picture(page)
+    left = {mode: pixels[:, : pixels.shape[1] // 2 - 4] for mode, pixels in pictures.items()}
+    right = {mode: pixels[:, pixels.shape[1] // 2 + 4 :] for mode, pixels in pictures.items()}
+    for mode in ("density", "0", "3"):
+        assert np.array_equal(left[mode], left["faint"])  # the truth
+        assert (right[mode] != right["faint"]).any()
+    assert (right["0"] != right["3"]).any()
+    assert "10, 50, 90% of 4 members" not in page.locator("#legend").inner_text()
+    page.select_option("#members", "density")
+    assert "10, 50, 90% of 4 members" in page.locator("#legend").inner_text()
+    density = page.evaluate("({ shares: [...viewer.ensemble.density.share(5)], cells: viewer.ensemble.density.cells })")
+    last = [member[5] for member in ensemble.members.values()]
+    expected = occupied_share(last, np.zeros(2), page.evaluate("scene.bands.cell"), tuple(density["cells"]))
+    difference = np.reshape(density["shares"], expected.shape[::-1]).T - expected
+    assert (np.abs(difference) > 1e-6).mean() < 0.01  # rounding moves few particles to another cell
+
+
+def test_the_chart_of_an_ensemble_shows_the_chosen_quantity(open_page):
+    ensemble = shown_ensemble()
+    page = open_page(ensemble)
+    page.keyboard.press("End")
+    names = page.locator("#quantity option").all_inner_texts()
+    assert [name.split(" (")[0] for name in names] == ["mean height", "front", "kinetic energy", "RMS position error"]
+    page.select_option("#quantity", label=names[1])
+    wait_until(page, "document.getElementById('now').textContent.includes('90%')")
+    fronts = [front(ensemble, member)[-1] for member in ensemble.members.values()]
+    low, high = np.quantile(fronts, [0.05, 0.95])
+    assert f"90%: {float(f'{low:.4g}'):g} … {float(f'{high:.4g}'):g}" in page.locator("#now").inner_text()
+    page.keyboard.press("m")
+    assert page.evaluate("viewer.ensemble.mode") == "density"
+
+
+@pytest.mark.slow
+def test_members_in_space_are_faint_or_one(open_page):
+    page = open_page(shown_ensemble(dim=3))
+    page.keyboard.press("End")
+    assert page.locator("#members option").all_inner_texts() == ["all, faint", *(f"member {k}" for k in range(4))]
+    several = picture(page)
+    page.select_option("#members", "0")
+    assert (picture(page) != several).any()

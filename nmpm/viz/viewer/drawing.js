@@ -4,7 +4,7 @@ const POINTS = `#version 300 es
 in vec3 position, previous, reference, material;
 in float field;
 uniform mat4 view; uniform vec3 low, extent, period; uniform vec4 plain;
-uniform float diameter, top; uniform int mode;   // see MODES below; 3 is the colour \`plain\`
+uniform float diameter, top, opacity; uniform int mode;   // see MODES below; 3 is the colour \`plain\`
 uniform highp sampler2D scale;
 out vec4 colour;
 bool absent(vec3 p) { return p.x > 0.999993; }  // ABSENT of page.py
@@ -18,6 +18,7 @@ void main() {
     : length(nearest(extent * (mode == 1 ? position - previous : position - reference))) / top;
   colour = mode == 0 ? vec4(material, 1.0) : mode == 3 ? plain
     : vec4(texture(scale, vec2(clamp(value, 0.002, 0.998), 0.5)).rgb, 1.0);
+  colour.a *= opacity;
 }`;
 const DISC = `#version 300 es
 precision highp float;
@@ -121,11 +122,15 @@ class Drawing {
 
   /**
    * Draws particles at a frame.
-   * @param look {mode, top, plain, diameter, field}: see the shader; top in domain lengths, field of all frames.
+   * @param look {mode, top, plain, diameter, field, opacity, stride}: see the shader; top in domain lengths, field of all
+   *   frames; the trajectory has each stride-th particle of the reference (1 if left out).
    */
   drawFrame(trajectory, reference, frame, view, look) {
     const gl = this.gl, size = trajectory.length / scene.frames;
-    const part = (positions, at) => positions.subarray(at * size, (at + 1) * size);
+    const part = (positions, at) => {
+      const length = positions.length / scene.frames;
+      return positions.subarray(at * length, (at + 1) * length);
+    };
     // Frame 0 has no frame before it: its speeds are those toward frame 1.
     const previous = frame > 0 ? frame - 1 : Math.min(1, scene.frames - 1);
     const needed = [part(trajectory, frame), part(trajectory, previous), part(reference, frame)];
@@ -147,19 +152,19 @@ class Drawing {
   }
 
   drawPoints(buffers, count, view, look) {
-    const gl = this.gl, at = this.points.at, high = scene.high, dim = scene.dim;
+    const gl = this.gl, at = this.points.at, high = scene.high, dim = scene.dim, { opacity = 1, stride = 1 } = look;
     if (!count) return;
     gl.useProgram(this.points.program);
     buffers.forEach((buffer, location) => {
       if (location && location !== OTHERS[look.mode]) return gl.disableVertexAttribArray(location);
       gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
       gl.enableVertexAttribArray(location);
-      gl.vertexAttribPointer(location, dim, gl.UNSIGNED_SHORT, true, 0, 0);
+      gl.vertexAttribPointer(location, dim, gl.UNSIGNED_SHORT, true, location === 2 ? 2 * dim * stride : 0, 0);
     });
     if (look.mode === MODES.material) {
       gl.bindBuffer(gl.ARRAY_BUFFER, this.colours);
       gl.enableVertexAttribArray(3);
-      gl.vertexAttribPointer(3, 3, gl.UNSIGNED_BYTE, true, 0, 0);
+      gl.vertexAttribPointer(3, 3, gl.UNSIGNED_BYTE, true, 3 * stride, 0);
     } else {
       gl.disableVertexAttribArray(3);
     }
@@ -171,6 +176,7 @@ class Drawing {
       gl.disableVertexAttribArray(4);
     }
     gl[dim === 3 ? "enable" : "disable"](gl.DEPTH_TEST);
+    gl.depthMask(opacity === 1);
     gl.uniformMatrix4fv(at("view"), false, view);
     gl.uniform3f(at("low"), ...inSpace(scene.low));
     gl.uniform3f(at("extent"), ...inSpace(scene.low.map((low, axis) => high[axis] - low)));
@@ -178,9 +184,11 @@ class Drawing {
     gl.uniform4f(at("plain"), ...look.plain);
     gl.uniform1f(at("diameter"), look.diameter);
     gl.uniform1f(at("top"), look.top);
+    gl.uniform1f(at("opacity"), opacity);
     gl.uniform1i(at("mode"), look.mode);
     gl.uniform1i(at("ball"), dim === 3);
     gl.drawArrays(gl.POINTS, 0, count);
+    gl.depthMask(true);
   }
 }
 

@@ -20,11 +20,16 @@ from numpy.typing import NDArray
 from nmpm._support.colours import hex_code, material_colours, vary_brightness
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import vertical_axis
+from nmpm.viz.occupancy import CELL, LEVELS, ensemble_colour
 from nmpm.viz.output import check_output, replace_picture
 from nmpm.viz.panel import particle_spacing
+from nmpm.viz.quantities import quantity_curves
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
-SCRIPTS = ("data.js", "matrices.js", "drawing.js", "layout.js", "curve.js", "viewer.js")
+SCRIPTS = (
+    "data.js", "matrices.js", "drawing.js", "density.js", "layout.js", "curve.js", "legend.js", "ensemble.js",
+    "viewer.js",
+)  # fmt: skip
 COLOUR_SCALE = "viridis"
 TOP_PERCENTILE = 99.5
 """Of speeds and errors: what the upper end of the colour scale stands for."""
@@ -33,6 +38,14 @@ FIELD_PERCENTILES = (0.5, 99.5)
 SAMPLED_FRAMES = 50
 STEPS = 65534
 """Steps from the lowest to the highest position along an axis: an error of at most 1 / 131068 of the box."""
+MEMBER_STEPS = 16
+"""Steps to which positions of further members are rounded: they take half the room, and nobody sees it."""
+MEMBER_BYTES = 2**26
+"""Largest size of further members' positions before they are deflated; beyond it some particles are left out."""
+MOST_LEFT_OUT = 40
+"""At least one in so many particles of a further member is on the page."""
+BAND_TINTS = (0.28, 0.5, 0.75)
+"""Share of the ensemble's colour in the bands at `LEVELS`; darker than in pictures, where particles lie over them."""
 ABSENT = 65535
 """Stands for the position of a particle that is not there."""
 
@@ -100,7 +113,6 @@ def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
     scale = np.round(255 * matplotlib.colormaps[COLOUR_SCALE](np.linspace(0, 1, 64))).astype(int).tolist()
     sampled = np.unique(np.linspace(0, len(first) - 1, SAMPLED_FRAMES).astype(int))
     moved = [path[sampled[1:]] - path[sampled[1:] - 1] for path in positions.values()]
-    longest = max(high - low for low, high in trajectories.outer_bounds)
     return {
         "title": trajectories.title or "nmpm",
         "every": every,
@@ -111,7 +123,6 @@ def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
         "period": list(trajectories.periods),
         "up": vertical_axis(trajectories),
         "tilt": trajectories.tilt,
-        "spacing": min(particle_spacing(trajectories.fullest_frame), longest / 20),
         "materials": [{"name": name, "colour": hex_code(colour)} for name, colour in colours.items()],
         "colours": pack_bytes(rgb),
         "scale": [hex_code((red, green, blue)) for red, green, blue, _ in scale],
@@ -119,19 +130,31 @@ def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
         "worst": _nearly_largest(trajectories, [other[sampled] - first[sampled] for other in others]),
         **_describe_motion(trajectories, positions, every),
         "fields": [_describe_field(trajectories, name, every) for name in trajectories.fields],
+        "curves": _describe_curves(trajectories, every),
     }
 
 
 def _describe_motion(trajectories: LabelledTrajectories, positions: dict[str, Floats], every: int) -> dict[str, Any]:
     """Packed positions, and errors in domain lengths."""
     obstacles = trajectories.obstacles.astype(np.float64)
-    corners = np.array(trajectories.outer_bounds).T
-    points = np.concatenate([corners, obstacles, *(each.reshape(-1, trajectories.dim) for each in positions.values())])
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    frames = len(next(iter(positions.values())))
+    longest = max(high - low for low, high in trajectories.outer_bounds)
+    spacing = particle_spacing(trajectories.fullest_frame)
+    frames, count, dim = next(iter(positions.values())).shape
+    room = 2 * frames * count * dim * len(trajectories.further_members)
+    stride = min(max(1, -(-room // MEMBER_BYTES)), MOST_LEFT_OUT)
+    further = {label: each[::every, ::stride] for label, each in trajectories.further_members.items()}
+
+    def extreme(find: np.ufunc) -> NDArray[np.float64]:
+        arrays = np.array(trajectories.outer_bounds).T, obstacles, *positions.values()
+        wrapped = (trajectories.wrap(each.astype(np.float64)) for each in further.values())
+        ends = [find.reduce(each.reshape(-1, dim), axis=0) for each in (*arrays, *wrapped) if each.size]
+        return np.asarray(find.reduce(np.stack(ends), axis=0))
+
+    low, high = extreme(np.fmin), extreme(np.fmax)
     errors = {label: curve[::every] for label, curve in trajectories.rms_errors().items()}
     return {
         "frames": frames,
+        "spacing": min(spacing, longest / 20),
         "low": low.tolist(),
         "high": (low + (high - low) * ABSENT / STEPS).tolist(),
         "obstacles": pack_positions(quantize(obstacles, low, high)[None]),
@@ -143,7 +166,43 @@ def _describe_motion(trajectories: LabelledTrajectories, positions: dict[str, Fl
             }
             for label, position in positions.items()
         ],
+        "members": [
+            {"label": label, "positions": _pack_member(trajectories.wrap(each.astype(np.float64)), low, high)}
+            for label, each in further.items()
+        ],
+        "bands": {
+            "stride": stride,
+            "cell": CELL * min(spacing * stride ** (1 / dim), longest / 20),
+            "levels": LEVELS,
+            "tints": BAND_TINTS,
+            "colour": hex_code(ensemble_colour(trajectories.materials)),
+        },
     }
+
+
+def _pack_member(position: Floats, low: NDArray[np.float64], high: NDArray[np.float64]) -> str:
+    steps = quantize(position, low, high)
+    return pack_positions(np.where(steps == ABSENT, ABSENT, steps // MEMBER_STEPS * MEMBER_STEPS).astype(np.uint16))
+
+
+def _describe_curves(trajectories: LabelledTrajectories, every: int) -> list[dict[str, Any]]:
+    """Derived quantities of an ensemble: of each member, of the truth or null, and bands, the widest first."""
+
+    def rounded(values: NDArray[np.float64]) -> list[float]:
+        return [float(f"{value:.4g}") for value in values[::every]]
+
+    return [
+        {
+            "name": curves.name,
+            "members": [rounded(member) for member in curves.members],
+            "truth": None if curves.truth is None else rounded(curves.truth),
+            "bands": [
+                {"percent": round(100 * share), "low": rounded(low), "high": rounded(high)}
+                for share, (low, high) in curves.bands().items()
+            ],
+        }
+        for curves in (quantity_curves(trajectories) if trajectories.members else [])
+    ]
 
 
 def _describe_field(trajectories: LabelledTrajectories, name: str, every: int) -> dict[str, Any]:

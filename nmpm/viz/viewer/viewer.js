@@ -6,11 +6,12 @@ const THEME_COLOURS = ["page", "text", "faint", "line", "inside", "wall", "ghost
 const element = (id) => document.getElementById(id);
 
 class Viewer {
-  /** @param fields For each field of the scene, values of each trajectory or null. */
-  constructor(drawing, trajectories, fields) {
+  /** @param fields For each field of the scene, values of each trajectory or null; @param members further ones. */
+  constructor(drawing, trajectories, fields, members) {
     Object.assign(this, { drawing, trajectories, fields, frame: 0, playing: false, drawn: 0, camera: new Camera() });
     this.setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
     this.fillChoices();
+    if (members.length) this.ensemble = new Ensemble(drawing, trajectories.at(-1), members);
     this.listen();
     new ResizeObserver(() => this.show()).observe(element("scene"));
     this.setColour("material");
@@ -43,6 +44,8 @@ class Viewer {
     on("slider", "input", () => this.seek(Number(element("slider").value)));
     on("colour", "change", () => this.setColour(this.colour));
     on("layout", "change", () => this.show());
+    on("members", "change", () => this.setMembers(this.ensemble.mode));
+    on("quantity", "change", () => this.show());
     on("reset", "click", () => this.reset());
     on("theme", "click", () => this.turnTheme());
     on("help", "click", () => element("keys").showModal());
@@ -62,7 +65,7 @@ class Viewer {
       " ": () => this.toggle(), ArrowRight: () => this.seek(this.frame + step), ArrowLeft: () => this.seek(this.frame - step),
       Home: () => this.seek(0), End: () => this.seek(this.frames - 1), "[": () => this.changeRate(-1), "]": () => this.changeRate(1),
       c: () => this.setColour(next(element("colour"))), o: () => this.setLayout(next(element("layout"))),
-      r: () => this.reset(), t: () => this.turnTheme(), f: () => document.documentElement.requestFullscreen(),
+      m: () => this.ensemble && this.setMembers(next(element("members"))), r: () => this.reset(), t: () => this.turnTheme(), f: () => document.documentElement.requestFullscreen(),
       "?": () => element("keys").showModal(),
     };
     const action = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
@@ -109,6 +112,12 @@ class Viewer {
     this.show();
   }
 
+  setMembers(mode) {
+    element("members").value = mode;
+    this.showLegend();
+    this.show();
+  }
+
   changeRate(by) {
     const rates = element("rate");
     rates.selectedIndex = Math.min(Math.max(rates.selectedIndex + by, 0), RATES.length - 1);
@@ -121,6 +130,7 @@ class Viewer {
 
   turnTheme() {
     this.setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
+    this.showLegend();
     this.show();
   }
 
@@ -164,7 +174,7 @@ class Viewer {
     const panels = this.panels();
     panels.forEach((panel) => this.drawPanel(panel, canvas.height, ratio));
     this.placeLabels(panels);
-    this.drawErrors();
+    this.drawChart();
     this.drawn += 1;
   }
 
@@ -172,12 +182,14 @@ class Viewer {
     const pixels = [x, canvasHeight / ratio - y - height, width, height].map((value) => Math.round(value * ratio));
     const { matrix, unit } = this.camera.view(width, height);
     const look = { mode: this.mode, top: this.top(), plain: [0, 0, 0, 1], diameter: 1.1 * scene.spacing * unit * ratio };
+    const ensemble = indices.includes(this.ensemble?.index) ? this.ensemble : null;
     this.drawing.startPanel(pixels, matrix, this.theme);
+    ensemble?.drawBehind(this.frame, matrix);
     this.drawing.drawObstacles(matrix, { ...look, mode: MODES.plain, plain: [...this.theme.ghost, 1] });
     for (const index of indices) {
-      const chosen = index === 0 ? this.referenceLook(look, indices.length > 1) : look;
-      this.drawing.drawFrame(
-        this.trajectories[index], this.trajectories[0], this.frame, matrix, this.fieldLook(chosen, index));
+      const chosen = this.fieldLook(index === 0 ? this.referenceLook(look, indices.length > 1) : look, index);
+      if (index === ensemble?.index) ensemble.draw(this.trajectories[0], this.frame, matrix, chosen);
+      else this.drawing.drawFrame(this.trajectories[index], this.trajectories[0], this.frame, matrix, chosen);
     }
   }
 
@@ -188,8 +200,11 @@ class Viewer {
     return field ? { ...look, field } : { ...look, mode: MODES.material };
   }
 
-  /** How the first trajectory is drawn: grey under another; without error, of which it has none. */
+  /** How the first trajectory is drawn: grey under another, dark over a density; without error, of which it has none. */
   referenceLook(look, under) {
+    if (this.trajectories.length < 2) return look;
+    if (under && this.ensemble?.isDensity)
+      return { ...look, mode: MODES.plain, plain: [...this.theme.text, 0.8], diameter: 0.6 * look.diameter };
     if (under) return { ...look, mode: MODES.plain, plain: [...this.theme.ghost, 0.7] };
     return look.mode === MODES.error ? { ...look, mode: MODES.material } : look;
   }
@@ -201,8 +216,9 @@ class Viewer {
 
   placeLabels(panels) {
     element("labels").replaceChildren(...panels.map(({ indices, x, y, width }) => {
-      const label = document.createElement("span"), names = indices.map((index) => scene.trajectories[index].label);
-      label.textContent = names.length > 1 ? `${names.slice(1).join(", ")} over ${names[0]} (grey)` : names[0];
+      const label = document.createElement("span"), names = indices.map((index) => this.nameOf(index));
+      label.textContent = names.length < 2 ? names[0]
+        : this.ensemble?.isDensity ? `${names[0]} (dots) over ${names[1]}` : `${names.slice(1).join(", ")} over ${names[0]} (grey)`;
       label.style.left = `${x + width / 2}px`;
       label.style.top = `${y - 24}px`;
       if (scene.tilt !== null) label.append(gravityNote(scene.tilt));
@@ -210,41 +226,26 @@ class Viewer {
     }));
   }
 
-  drawErrors() {
-    const others = scene.trajectories.slice(1);
-    if (!others.length) return;
-    const colours = others.map((_, index) => (index === 0 ? this.theme.accent : this.theme.faint));
-    drawCurve(element("curve"), others.map(({ errors }) => errors), colours, this.frame, this.theme);
-    element("error-now").textContent = others
-      .map(({ label, errors }) => `${label}: ${digits(errors[this.frame])} from ${scene.trajectories[0].label}`).join("\n");
+  nameOf(index) {
+    return index === this.ensemble?.index ? this.ensemble.label : scene.trajectories[index].label;
+  }
+
+  drawChart() {
+    const chart = this.ensemble ? this.ensemble.chart(this.frame, this.theme) : this.errorChart();
+    if (!chart.lines.length) return;
+    drawCurve(element("curve"), chart, this.frame, this.theme);
+    element("now").textContent = chart.now.join("\n");
+  }
+
+  errorChart() {
+    const [{ label: reference }, ...others] = scene.trajectories;
+    const lines = others.map(({ errors }, index) => ({ values: errors, colour: index ? this.theme.faint : this.theme.accent }));
+    const now = others.map(({ label, errors }) => `${label}: ${digits(errors[this.frame])} from ${reference}`);
+    return { title: "root mean square error", bands: [], lines, now };
   }
 
   showLegend() {
-    const legend = element("legend");
-    if (this.colour === "material") {
-      legend.replaceChildren(...scene.materials.map(({ name, colour }) => {
-        const entry = document.createElement("span"), dot = document.createElement("i");
-        dot.style.background = colour;
-        entry.append(dot, name);
-        return entry;
-      }));
-      return;
-    }
-    const bar = document.createElement("canvas"), context = bar.getContext("2d");
-    bar.width = scene.scale.length;
-    bar.height = 1;
-    scene.scale.forEach((colour, at) => {
-      context.fillStyle = colour;
-      context.fillRect(at, 0, 1, 1);
-    });
-    if (this.mode === MODES.field) {
-      const { low, high } = scene.fields[this.fieldIndex];
-      legend.replaceChildren(`${Number(low.toPrecision(4))} or less`, bar, `${Number(high.toPrecision(4))} or more`);
-      return;
-    }
-    const unit = this.colour === "speed" ? "length per second" : "length";
-    const end = this.colour === "speed" ? scene.fastest / scene.dt : scene.worst;
-    legend.replaceChildren("0", bar, `${Number(end.toPrecision(2))} ${unit} or more`);
+    element("legend").replaceChildren(...colourLegend(this), ...(this.ensemble?.legend(this.theme) ?? []));
   }
 
   panelUnder(event) {
@@ -267,24 +268,16 @@ class Viewer {
   }
 }
 
-/** Says where gravity points: an angle from straight down, counterclockwise in radians. */
-function gravityNote(tilt) {
-  const note = document.createElement("small"), arrow = document.createElement("i");
-  arrow.textContent = "↓";
-  arrow.style.transform = `rotate(${-tilt}rad)`;
-  note.append("gravity ", arrow);
-  return note;
-}
-
 /** The option after the chosen one, in a circle. */
 const next = (choice) => choice.options[(choice.selectedIndex + 1) % choice.options.length].value;
 
 async function start() {
   const trajectories = await Promise.all(scene.trajectories.map(readTrajectory));
   const obstacles = undoDifferences(await inflate(scene.obstacles), 1);
+  const members = await Promise.all(scene.members.map(readTrajectory));
   const drawing = new Drawing(element("scene"), await inflate(scene.colours), obstacles);
   const fields = await Promise.all(scene.fields.map(({ values }) => Promise.all(values.map(readField))));
-  window.viewer = new Viewer(drawing, trajectories, fields);
+  window.viewer = new Viewer(drawing, trajectories, fields, members);
   element("message").hidden = true;
 }
 
