@@ -18,6 +18,7 @@ from nmpm.cli.match_options import MATERIALS, STRICT, STRIDE, MatchOptions, desc
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.loading.sources import FolderSource
 from nmpm.emulator import EmulatorRecipe
+from nmpm.emulator.adaptation import adapted, with_members
 from nmpm.emulator.similarity import Match
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.scene import Reading, Scene
@@ -78,6 +79,9 @@ class MatchedRun:
         if checkpoint is not None and not ((stored := stored_scene(checkpoint)) and stored.differences(data.scene)):
             return None
         model = load_model(str(start)) if checkpoint is None else load_checkpoint(checkpoint)
+        if checkpoint is None:
+            recipe = with_members(model.emulator.recipe, config["model"]["members"])
+            model = dataclasses.replace(model, emulator=adapted(model.emulator, recipe))
         match = match_data(model, data, *MatchOptions.read(config["materials"], config["stride"], config["strict"]))
         different = tuple(key for key in FORM if _differs(config["model"][key], match.recipe, key))
         stated = stated_keys(read_options(sys.argv[2:]), "model") if checkpoint is None else set()

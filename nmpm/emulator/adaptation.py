@@ -57,6 +57,13 @@ def adapted(emulator: Emulator, recipe: EmulatorRecipe) -> Emulator:
     return _with_mode_of(emulator, other)
 
 
+def with_members(recipe: EmulatorRecipe, members: int) -> EmulatorRecipe:
+    """The recipe whose processor reads noise, if there are to be several members."""
+    if members == 1 or isinstance(recipe.processor, Stochastic):
+        return recipe
+    return dataclasses.replace(recipe, processor=Stochastic(recipe.processor))
+
+
 @torch.no_grad()
 def with_noise(emulator: Emulator, processor: Stochastic | None = None) -> Emulator:
     """A copy of an emulator whose network also reads noise, which changes nothing before a training.

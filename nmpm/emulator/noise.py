@@ -34,11 +34,11 @@ class Noise:
 
 
 def training_noise(emulator: Emulator, scenes: int, members: int, calls: int) -> Tensor | None:
-    """(B, M, calls, Z, *S) for a training step, from torch's random state; None for a processor without noise.
+    """(B, M, calls, Z, *S) for a training step of M >= 2 members, from torch's random state; None for one member.
 
     Each of several processes gets its rows of the numbers drawn for all.
     """
-    if not emulator.processor.noise:
+    if members == 1:
         return None
     shape = (scenes, members, calls, emulator.processor.noise, *emulator.grid.shape)
     return normal_like(torch.empty(shape, device=emulator.device))

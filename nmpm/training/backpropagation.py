@@ -20,8 +20,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from nmpm._support.threads import map_ranges
-from nmpm.emulator import Bundle, Emulator, RolloutContext
-from nmpm.particles import Particles
+from nmpm.emulator import Bundle, Emulator, Prescribed, Rollout, RolloutContext
+from nmpm.emulator.rollouts import Call, unroll_with_gradients
+from nmpm.particles import Particles, Window
 
 T = TypeVar("T")
 
@@ -33,6 +34,35 @@ def direct(emulator: Emulator, particles: Particles, context: RolloutContext) ->
     """A call of the emulator that keeps its activations for the backward pass."""
     bundle: Bundle = emulator(particles, context)
     return bundle
+
+
+def predict_window(
+    emulator: Emulator,
+    start: Particles,
+    window: Window,
+    bundles: int,
+    call: Call,
+    discount: float,
+    noise: Tensor | None,
+) -> Rollout:
+    """The frames of a training step, with gradients discounted from each bundle to the one before.
+
+    Args:
+        emulator: In training mode.
+        start: Of the windows, perhaps with noise on its positions.
+        window: Says which particles enter and leave, and how obstacles move.
+        bundles: How many.
+        call: Keeps a bundle's activations, or computes them again.
+        discount: In [0, 1].
+        noise: (B, M, bundles, Z, *S) of M members of each of B windows, which follow each other in `start`.
+    """
+
+    def state_after(bundle: Bundle, start: Particles) -> Particles:
+        return discount_gradients(bundle.state_after(start), discount)
+
+    drawn = None if noise is None else noise.flatten(0, 1).unbind(1)
+    made = unroll_with_gradients(emulator, start, bundles, call, state_after, Prescribed.of(window), drawn)
+    return Rollout.join([Rollout(bundle.position, bundle.fields) for bundle in made])
 
 
 def discount_gradients(particles: Particles, factor: float) -> Particles:

@@ -50,23 +50,29 @@ class TrainingError:
             ValueError: if the window has fewer frames than were predicted, or other particles.
         """
         target = window.target[:, : predicted.shape[1]]
+        error = self.of_positions(predicted, target, window, grid, frames)
+        if not self.density_weight:
+            return error
+        last, there = last_frames(window, predicted.shape[1], frames)
+        density = density_error(predicted[last], target[last], window, scene, grid, there)
+        return error + self.density_weight * density
+
+    def of_positions(self, predicted: Tensor, target: Tensor, window: Window, grid: Grid, frames: int) -> Tensor:
+        """The error () of positions (B, K m, N, D) alone, against others of the window's particles."""
         check_comparable(predicted, target, frames)
-        last: tuple[slice | Tensor, ...] = (slice(None), slice(frames - 1, None, frames))
-        there = None
         if _some_are_missing(window):
             counts = counted(window, predicted.shape[1], frames)
             squared = grid.to_cell_displacement(predicted - target, predicted.dtype).square().mean(-1)
-            last = last if window.observed is None else _last_observed(window.observed[:, 2:], predicted, frames)
-            error, there = _tempered_mean(squared, counts, frames, self.power), counts[last]
-        elif self.power == 1:
-            error = position_error(predicted, target, window.mask, grid)
-        else:
-            errors = position_errors(predicted, target, window.mask, grid, frames)
-            error = tempered_error(errors, window.mask, self.power)
-        if not self.density_weight:
-            return error
-        density = density_error(predicted[last], target[last], window, scene, grid, there)
-        return error + self.density_weight * density
+            return _tempered_mean(squared, counts, frames, self.power)
+        if self.power == 1:
+            return position_error(predicted, target, window.mask, grid)
+        return tempered_error(position_errors(predicted, target, window.mask, grid, frames), window.mask, self.power)
+
+    def of_fields(
+        self, predicted: Mapping[str, Tensor], window: Window, spread: Mapping[str, Tensor], frames: int
+    ) -> Tensor:
+        """`field_error` of predicted fields, with this power."""
+        return field_error(predicted, field_targets(predicted, window), window, spread, frames, self.power)
 
 
 def counted(window: Window, frames: int, bundle: int) -> Tensor:
@@ -84,18 +90,29 @@ def _some_are_missing(window: Window) -> bool:
     return window.present is not None or window.observed is not None
 
 
-def _last_observed(observed: Tensor, predicted: Tensor, bundle: int) -> tuple[Tensor, Tensor]:
+def last_frames(window: Window, frames: int, bundle: int) -> tuple[tuple[slice | Tensor, ...], Tensor | None]:
+    """The last frame of each bundle, as an index of (B, frames, …), and the particles (B, K, N) that count there.
+
+    That of the last one that was observed, where frames are missing; None for particles that are all there.
+    """
+    last: tuple[slice | Tensor, ...] = (slice(None), slice(bundle - 1, None, bundle))
+    if not _some_are_missing(window):
+        return last, None
+    if window.observed is not None:
+        last = _last_observed(window.observed[:, 2 : 2 + frames], bundle)
+    return last, counted(window, frames, bundle)[last]
+
+
+def _last_observed(observed: Tensor, bundle: int) -> tuple[Tensor, Tensor]:
     """Indices (B, 1) and (B, K) of the last frame of each bundle that was observed; the last one if none was.
 
     Args:
-        observed: (B, T) whether each frame was, T at least that of `predicted`.
-        predicted: (B, K m, …), m frames to a bundle.
+        observed: (B, K m) whether each frame was.
         bundle: m.
     """
-    batch, frames = predicted.shape[:2]
-    backwards = observed[:, :frames].unflatten(1, (-1, bundle)).flip(2).int()
-    ends = torch.arange(bundle - 1, frames, bundle, device=observed.device)
-    return torch.arange(batch, device=observed.device).unsqueeze(1), ends - backwards.argmax(2)
+    backwards = observed.unflatten(1, (-1, bundle)).flip(2).int()
+    ends = torch.arange(bundle - 1, observed.shape[1], bundle, device=observed.device)
+    return torch.arange(len(observed), device=observed.device).unsqueeze(1), ends - backwards.argmax(2)
 
 
 def _tempered_mean(values: Tensor, counts: Tensor, frames: int, power: float) -> Tensor:
@@ -107,28 +124,37 @@ def _tempered_mean(values: Tensor, counts: Tensor, frames: int, power: float) ->
     return mean
 
 
+def field_targets(predicted: Mapping[str, Tensor], window: Window) -> dict[str, Tensor]:
+    """The window's values (B, K m, N) of predicted fields; those that it lacks are left out."""
+    names = [name for name in predicted if name in window.fields]
+    return {name: window.field_target(name)[:, : predicted[name].shape[1]] for name in names}
+
+
 def field_error(
-    predicted: Mapping[str, Tensor], window: Window, spread: Mapping[str, Tensor], frames: int, power: float = 1.0
+    predicted: Mapping[str, Tensor],
+    target: Mapping[str, Tensor],
+    window: Window,
+    spread: Mapping[str, Tensor],
+    frames: int,
+    power: float = 1.0,
 ) -> Tensor:
     """The error () of evolving fields in units of their spread: a mean over particles, summed over fields.
 
     Args:
-        predicted: (B, K m, N) by name, m frames to a bundle. Fields that the window lacks are left out.
-        window: The truth.
+        predicted: (B, K m, N) by name, m frames to a bundle. Fields that have no target are left out.
+        target: Likewise.
+        window: Says which particles count.
         spread: () of each field in the training data.
         frames: m.
         power: As of `TrainingError`.
     """
     total = torch.zeros((), device=window.mask.device)
-    for name, values in predicted.items():
-        if name in window.fields:
-            target = window.field_target(name)[:, : values.shape[1]]
-            squared = ((values - target) / spread[name]).square()
-            if _some_are_missing(window):
-                total = total + _tempered_mean(squared, counted(window, values.shape[1], frames), frames, power)
-                continue
-            errors = _bundle_means(squared, window.mask, frames)
-            total = total + tempered_error(errors, window.mask, power)
+    for name, values in target.items():
+        squared = ((predicted[name] - values) / spread[name]).square()
+        if _some_are_missing(window):
+            total = total + _tempered_mean(squared, counted(window, values.shape[1], frames), frames, power)
+            continue
+        total = total + tempered_error(_bundle_means(squared, window.mask, frames), window.mask, power)
     return total
 
 
@@ -196,19 +222,31 @@ def density_error(
         grid: Where densities are compared, by linear weights.
         there: (B, F, N) bool, which particles count in each frame; the real ones when left out.
     """
+    predicted_fraction, true_fraction = (
+        volume_fractions(position, window, scene, grid, there) for position in (predicted, target)
+    )
+    size = 1.0 if window.volume is None else window.volume.unsqueeze(1)
+    counting = window.mask.unsqueeze(1) if there is None else there
+    total = (size * counting).sum() * (predicted.shape[1] if there is None else 1)
     fraction = scene.particle_volume / grid.cell_volume
-    cells = (grid.to_cells(frames, frames.dtype) for frames in (predicted, target))
-    kernels = there is None and takes("numba", TRAINING_ERRORS, PositionPair(predicted, target, grid))
+    error: Tensor = (predicted_fraction - true_fraction).square().sum() / (2 * fraction * total.clamp(min=1e-30))
+    return error
+
+
+def volume_fractions(position: Tensor, window: Window, scene: Scene, grid: Grid, there: Tensor | None = None) -> Tensor:
+    """(B, F, nodes and materials) volume fractions by linear weights, of positions (B, F, N, D).
+
+    Args and gradients as `density_error`.
+    """
+    cells, fraction = grid.to_cells(position, position.dtype), scene.particle_volume / grid.cell_volume
+    kernels = there is None and takes("numba", TRAINING_ERRORS, PositionPair(position, position.detach(), grid))
     if kernels and (sizes := scene_volumes(window.volume, window.mask)) is not None:
-        scale = fraction * sizes.view(-1, 1, 1, 1)
-        predicted_fraction, true_fraction = (scale * _kernel_counts(of, window, scene, grid) for of in cells)
-        total = (window.mask.sum(1) * sizes).sum() * predicted.shape[1]
-    else:
-        volume = _volumes(window, predicted.shape[1], scene, there).to(predicted.dtype)
-        sums = (Linear().p2g(volume.flatten(0, 1), of.flatten(0, 1), grid) for of in cells)
-        predicted_fraction, true_fraction = (fraction * each for each in sums)
-        total = volume.sum().clamp(min=torch.finfo(volume.dtype).tiny)
-    return (predicted_fraction - true_fraction).square().sum() / (2 * fraction * total)
+        return (fraction * sizes.view(-1, 1, 1, 1) * _kernel_counts(cells, window, scene, grid)).flatten(2)
+    volume = _volumes(window, position.shape[1], scene, there).to(position.dtype)
+    sums = Linear().p2g(volume.flatten(0, 1), cells.flatten(0, 1), grid)
+    fractions: Tensor = fraction * sums.flatten(1)
+    by_frame: Tensor = fractions.unflatten(0, position.shape[:2])
+    return by_frame
 
 
 def _volumes(window: Window, frames: int, scene: Scene, there: Tensor | None) -> Tensor:

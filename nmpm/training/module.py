@@ -21,23 +21,26 @@ from nmpm._support.collectives import global_mean
 from nmpm._support.digests import weights_digest
 from nmpm._support.plain_data import class_path
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, Prescribed, Rollout
+from nmpm.emulator import Emulator, EmulatorRecipe
+from nmpm.emulator.adaptation import adapted, with_members
 from nmpm.emulator.calibration import calibrate, calibrate_unread, unread_inputs
 from nmpm.emulator.fields import warn_of_ignored
+from nmpm.emulator.noise import training_noise
 from nmpm.emulator.recipe import FORMAT, check_format
-from nmpm.emulator.rollouts import recomputed, unroll_with_gradients
+from nmpm.emulator.rollouts import recomputed
 from nmpm.errors import ConfigError
 from nmpm.metrics import RolloutMetric
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.training import checkpoints, preflight
 from nmpm.training.augmentation import check_jitter, check_mirrors, mirror_half, noisy_start, with_jitter
-from nmpm.training.backpropagation import direct, discount_gradients, mean_over_parts
+from nmpm.training.backpropagation import direct, mean_over_parts, predict_window
 from nmpm.training.budget import Clock, check_end, total_steps
 from nmpm.training.evaluation import EvaluatedModule
-from nmpm.training.losses import TrainingError, counted, field_error
+from nmpm.training.losses import counted
 from nmpm.training.optimization import OptimizerCallable, Schedule, adam, build_optimizer, with_learning_rate
 from nmpm.training.recorded_steps import MULTIPLE, RecordedSteps, can_record
+from nmpm.training.scores import repeated, training_error
 
 CALIBRATION_BATCHES = 4
 
@@ -59,6 +62,9 @@ class EmulatorModule(EvaluatedModule):
             before the mean, as are those of fields. At 0.5, calm windows and early bundles weigh as much as splashes;
             at 1, mean squares.
         position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
+        members: M. From 2 on, a processor that reads noise (`nmpm.processors.Stochastic`) predicts each window M times,
+            and is trained by a score that teaches it how uncertain it is, see `nmpm.training.scores`; `error_power`
+            does not act.
         mirror: Axes along which half of the training windows are mirrored; those without gravity.
         jitter: Cells, up to half of one, by which the grid is moved at most in each training step, within the scene's
             wall layer: where cells lie is chance, on which little should depend.
@@ -82,6 +88,7 @@ class EmulatorModule(EvaluatedModule):
         density_weight: float = 4.0,
         field_weight: float = 1.0,
         error_power: float = 0.5,
+        members: int = 1,
         position_noise: float = 0.0,
         mirror: Sequence[int] = (),
         jitter: float = 0.0,
@@ -92,7 +99,7 @@ class EmulatorModule(EvaluatedModule):
         seed: int = 0,
         **recipe: Any,
     ) -> None:
-        emulator = EmulatorRecipe(scene, **recipe).build()
+        emulator = with_members(EmulatorRecipe(scene, **recipe), members).build()
         super().__init__(emulator, emulator.frames * unroll, metrics)
         for name, share in (("unroll_growth", unroll_growth), ("gradient_discount", gradient_discount)):
             if not 0 <= share <= 1:
@@ -100,7 +107,7 @@ class EmulatorModule(EvaluatedModule):
         self.unroll, self.unroll_growth, self.gradient_discount = unroll, unroll_growth, gradient_discount
         self.make_optimizer = optimizer
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
-        self.error = TrainingError(density_weight, error_power)
+        self.error, self.members = training_error(members, density_weight, error_power), members
         self.field_weight = field_weight
         self.mirror, self.jitter, self.position_noise = tuple(mirror), jitter, position_noise
         check_mirrors(emulator.scene, self.mirror)
@@ -111,9 +118,9 @@ class EmulatorModule(EvaluatedModule):
         arguments = emulator.recipe.to_dict() | {
             "unroll": unroll, "unroll_growth": unroll_growth, "gradient_discount": gradient_discount,
             "schedule": dataclasses.asdict(self.schedule), "density_weight": density_weight,
-            "field_weight": field_weight, "error_power": error_power, "position_noise": position_noise,
-            "mirror": list(mirror), "jitter": jitter, "recompute": recompute, "compile": compile, "record": record,
-            "seed": seed,
+            "field_weight": field_weight, "error_power": error_power, "members": members,
+            "position_noise": position_noise, "mirror": list(mirror), "jitter": jitter, "recompute": recompute,
+            "compile": compile, "record": record, "seed": seed,
         }  # fmt: skip
         del arguments["format"]  # (of the checkpoint, see on_save_checkpoint)
         self.save_hyperparameters(arguments, logger=False)
@@ -133,7 +140,7 @@ class EmulatorModule(EvaluatedModule):
                 emulator's, for example its `constraints`.
         """
         module = cls(**(vars(emulator.recipe) | options))
-        module.emulator.load_state_dict(emulator.state_dict())
+        module.emulator.load_state_dict(adapted(emulator, module.emulator.recipe).state_dict())
         return module
 
     @property
@@ -233,32 +240,29 @@ class EmulatorModule(EvaluatedModule):
         if recorded:
             error = self._recorded.mean_error(mean_error, self.emulator, emulator, start, batch, count)
         else:
-            rows, of = self.rows(batch), lambda part: mean_error(emulator, start.scenes(part), batch.scenes(part))
+            rows, noise = self.rows(batch), training_noise(emulator, len(start.mask), self.members, count)
+            of = lambda p: mean_error(emulator, start.scenes(p), batch.scenes(p), None if noise is None else noise[p])  # noqa: E731
             error = mean_over_parts(of, counts, rows, self.parameters(), self.threads or len(rows))
         loss, logged = global_mean(error, counts.sum() if counts.dim() == 2 else counts.sum() / counts.shape[1])
         self.log("train/loss", logged)
         return loss
 
-    def _mean_error(self, count: int, emulator: Emulator, start: Particles, window: Window) -> Tensor:
-        """The mean error () of `count` bundles from the start of windows."""
+    def _mean_error(
+        self, count: int, emulator: Emulator, start: Particles, window: Window, noise: Tensor | None = None
+    ) -> Tensor:
+        """The mean error () of `count` bundles from the start of windows, in float32 whatever autocast says.
 
-        def state_after(bundle: Bundle, start: Particles) -> Particles:
-            return discount_gradients(bundle.state_after(start), self.gradient_discount)
-
-        call, given = recomputed if self.recompute else direct, Prescribed.of(window)
-        bundles = unroll_with_gradients(emulator, start, count, call, state_after, given)
-        predicted = Rollout.join([Rollout(bundle.position, bundle.fields) for bundle in bundles])
-        return self._error(predicted, window)
-
-    def _error(self, predicted: Rollout, batch: Window) -> Tensor:
-        """The error of K m predicted frames, in float32 whatever autocast says."""
-        emulator = self.emulator
+        The members' noise, (B, M, count, Z, *S), is drawn if it is left out.
+        """
+        noise = training_noise(emulator, len(start.mask), self.members, count) if noise is None else noise
+        start, members = repeated(start, self.members), repeated(window, self.members)
+        call = recomputed if self.recompute else direct
+        predicted = predict_window(emulator, start, members, count, call, self.gradient_discount, noise)
         with torch.autocast(predicted.position.device.type, enabled=False):
-            error = self.error(predicted.position, batch, emulator.scene, emulator.grid, emulator.frames)
+            error = self.error(predicted.position, window, emulator.scene, emulator.grid, emulator.frames)
             if not (predicted.fields and self.field_weight):
                 return error
-            spread = emulator.field_scales.spread
-            of_fields = field_error(predicted.fields, batch, spread, emulator.frames, self.error.power)
+            of_fields = self.error.of_fields(predicted.fields, window, emulator.field_scales.spread, emulator.frames)
             return error + self.field_weight * of_fields
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:

@@ -112,10 +112,12 @@ def test_rows_are_shared_evenly(count, parts, sizes):
     assert [row for part in rows for row in range(count)[part]] == list(range(count))
 
 
+@pytest.mark.parametrize("members", [1, 3])
 @pytest.mark.parametrize("recompute", [False, True])
 @pytest.mark.parametrize("processor", [TINY, FNO(width=4, modes=2, layers=1)], ids=["unet", "fno"])
-def test_parts_have_the_error_and_the_gradients_of_the_whole(step, processor, recompute):
-    module, batch = step(processor, recompute=recompute, position_noise=1e-3, jitter=0.1, mirror=(0,))
+def test_parts_have_the_error_and_the_gradients_of_the_whole(step, processor, recompute, members):
+    options = {"recompute": recompute, "position_noise": 1e-3, "jitter": 0.1, "mirror": (0,), "members": members}
+    module, batch = step(processor, **options)
     whole = gradients(module, batch)
     for part, other in zip(gradients(module, batch, 3, 3), whole, strict=True):
         torch.testing.assert_close(part, other, rtol=1e-4, atol=1e-5 * float(other.abs().max()))

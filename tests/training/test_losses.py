@@ -6,7 +6,7 @@ import torch
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.particles import Window
-from nmpm.training.losses import TrainingError, density_error, field_error, position_error, position_errors
+from nmpm.training.losses import TrainingError, density_error, position_error, position_errors
 from tests.scenes import box, cloud, padded, window_of
 
 
@@ -129,5 +129,5 @@ def test_the_error_of_fields_is_the_mean_square_in_units_of_the_spread():
     predicted = torch.full((2, 4, 3), 0.2)
     predicted[1, :, 1:] = 1e6
     spread = {"heat": torch.tensor(0.1)}
-    error = field_error({"heat": predicted, "other": predicted}, window, spread, frames=2, power=0.5)
+    error = TrainingError(0.0, 0.5).of_fields({"heat": predicted, "other": predicted}, window, spread, frames=2)
     assert float(error) == pytest.approx((4 + 1e-4) ** 0.5)

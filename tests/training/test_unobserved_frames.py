@@ -17,7 +17,7 @@ from nmpm.grid import Grid
 from nmpm.metrics import MSE, EarthMover
 from nmpm.particles import Window
 from nmpm.scene import Reading
-from nmpm.training.losses import TrainingError, counted, field_error
+from nmpm.training.losses import TrainingError, counted
 from tests.made_up import made_up_metadata, made_up_trajectory
 from tests.scenes import box, cloud
 from tests.trainings import data_of, module_of, trainer_of
@@ -108,7 +108,7 @@ def test_errors_and_their_gradients_do_not_depend_on_frames_that_nobody_observed
     perfect = TrainingError(weight, 1.0)
     assert perfect(wrong, window, box(), grid, 4) == 0  # also in bundles without an observed frame
     heat = torch.where(window.observed[:, 2:, None], 1.0, 7.0).expand(2, 16, 6)
-    assert field_error({"heat": heat}, window, {"heat": torch.tensor(1.0)}, 4) == 0
+    assert TrainingError().of_fields({"heat": heat}, window, {"heat": torch.tensor(1.0)}, 4) == 0
 
 
 def test_frames_that_were_all_observed_have_the_errors_of_plain_ones():
