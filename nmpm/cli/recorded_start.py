@@ -1,10 +1,11 @@
-"""Starts of `nmpm rollout --data`: a recorded trajectory, and how a model takes it where it is of another kind."""
+"""Recordings of `nmpm rollout --data`: how a model takes them where they are of another kind, and its errors."""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +22,11 @@ from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import SplitRecordings
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.volumes import VOLUME
+from nmpm.emulator import Rollout
 from nmpm.emulator.fields import warn_of_ignored
 from nmpm.errors import ConfigError
+from nmpm.evaluation.comparison import Comparison
+from nmpm.metrics import MSE
 from nmpm.particles import Window
 from nmpm.scene import Reading, Scene, is_same_volume
 from nmpm.zoo import Pretrained
@@ -117,3 +121,19 @@ def is_of_kind(scene: Scene, metadata: Metadata, split: Split, index: int) -> bo
     if not np.isclose(metadata.dt, scene.dt, rtol=1e-3):
         return gravity is None and "dt" in guessed
     return scene.gravity_varies or gravity is None or scene.gravity is None or is_gravity_of(scene, gravity)
+
+
+def compared(window: Window, rollout: Rollout, options: argparse.Namespace) -> str:
+    """Of which recording errors are, and over how many frames."""
+    frames = min(window.target.shape[1], rollout.position.shape[1])
+    return f"{options.data}, trajectory {options.trajectory}, {frames} frames:"
+
+
+def recorded_errors(scene: Scene, bundle: int, window: Window, rollouts: Iterable[Rollout]) -> dict[str, float]:
+    """Mean errors of rollouts against one recording, and of the trivial predictors, over the frames that both have."""
+    comparison = Comparison(scene, [MSE()], bundle)
+    for rollout in rollouts:
+        frames = min(window.target.shape[1], rollout.position.shape[1])
+        fields = {name: values[:, :frames] for name, values in rollout.fields.items()}
+        comparison.update(window.first(frames + 2), rollout.position[:, :frames], fields)
+    return {name: float(value) for name, value in comparison.compute().items()}

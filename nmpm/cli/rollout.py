@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,6 +31,7 @@ from nmpm.data.write import find_writer, write_trajectory
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
+    from nmpm.data.format import Trajectory
     from nmpm.emulator import Prescribed, Rollout
     from nmpm.particles import Particles, Window
     from nmpm.scene import Scene
@@ -50,6 +53,7 @@ examples:
   nmpm rollout runs/goop/checkpoints/last.ckpt
   nmpm rollout goop --out splash.usda                    for Blender; .vtkhdf for ParaView, .csv, …
   nmpm rollout goop --device cuda                        on a GPU, by CUDA graphs
+  nmpm rollout waterramps --members 8                    eight futures from one start, a trajectory each
 """
 
 
@@ -67,25 +71,38 @@ def run(words: list[str]) -> None:
 def _from_blocks(model: Pretrained, options: argparse.Namespace) -> str:
     """Roll out from thrown blocks; return how to look at what is written."""
     model = _optimized(model, options)
-    state = _thrown_state(model, options)
-    rollout = _predict(model, state, None, options.frames or FRAMES, options)
+    state, frames = _thrown_state(model, options), options.frames or FRAMES
+    if options.members is not None:
+        from nmpm.cli.member_rollouts import MemberRollouts
+
+        return MemberRollouts(model, model.scene, state, state, frames, options).run()
+    rollout = predict(model, state, None, frames, options)
     return _write(model, model.scene, state, rollout, None, options)
 
 
 def _from_recording(model: Pretrained, options: argparse.Namespace) -> str:
     """Roll out from a recorded trajectory and print the errors; return how to look at what is written."""
-    from nmpm.cli.recorded_start import RecordedStart
+    from rich.console import Console
+
+    from nmpm.cli.member_rollouts import MemberRollouts
+    from nmpm.cli.recorded_start import RecordedStart, compared, recorded_errors
     from nmpm.emulator import Prescribed
+    from nmpm.evaluation.figures import error_table
 
     start = RecordedStart.of(model, options)
     model, written = _optimized(start.model, options), start.written
     recorded = written.target.shape[1]
     frames = options.frames or recorded or FRAMES
-    prescribed = Prescribed.of(start.window)
-    rollout = _predict(model, start.window.initial, prescribed, frames, options, start.between)
-    hint = _write(model, start.scene, written.initial, rollout, written if recorded else None, options)
+    prescribed, window = Prescribed.of(start.window), written if recorded else None
+    if options.members is not None:
+        states = start.window.initial, written.initial
+        members = MemberRollouts(model, start.scene, *states, frames, options, start.between, prescribed, window)
+        return members.run(predict(model, states[0], prescribed, frames, options, start.between) if recorded else None)
+    rollout = predict(model, start.window.initial, prescribed, frames, options, start.between)
+    hint = _write(model, start.scene, written.initial, rollout, window, options)
     if recorded:
-        _print_errors(start.scene, max(1, model.emulator.frames // start.between), written, rollout, options)
+        bundle, what = max(1, model.emulator.frames // start.between), compared(written, rollout, options)
+        Console().print(error_table(what, recorded_errors(start.scene, bundle, written, [rollout])))
     return hint
 
 
@@ -117,7 +134,20 @@ def _parser() -> argparse.ArgumentParser:
     add_match_options(parser)
     add_data_options(parser)
     parser.add_argument("--trajectory", type=int, default=0, help="index in --data (default: 0, the first)")
-    parser.add_argument("--seed", type=int, default=0, help="of the thrown blocks (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="of the thrown blocks, and of members (default: 0)")
+    parser.add_argument(
+        "--members",
+        type=int,
+        metavar="M",
+        help="rollouts from the same start, by a model's own noise or from nudged positions; a trajectory each, in one"
+        " .h5 or .vtkhdf, or in out-0.csv, out-1.csv, …",
+    )
+    parser.add_argument(
+        "--nudge",
+        type=float,
+        metavar="CELLS",
+        help="standard deviation of the displacements of members' starts (default: the model's, see nmpm zoo card)",
+    )
     parser.add_argument("--particles", type=int, default=1000, help="approximate number to throw (default: 1000)")
     parser.add_argument("--blocks", type=int, help="number of blocks (default: one of each material)")
     parser.add_argument(
@@ -148,8 +178,20 @@ def _check(options: argparse.Namespace) -> None:
         raise ConfigError("--materials, --stride and --strict are about recorded data: give --data too.")
     elif facts := [fact for fact in stated_facts(options) if not fact.startswith("--gravity")]:
         raise ConfigError(f"{facts[0]} is about recorded data: give --data too.")
-    find_writer("--out", options.out)
+    _check_members(options)
     check_device(options.device)
+
+
+def _check_members(options: argparse.Namespace) -> None:
+    """Check the numbers of members, and that all files can be written."""
+    check_at_least("--members", options.members, 1)
+    if options.nudge is not None and options.members is None:
+        raise ConfigError(f"--nudge {options.nudge} displaces the starts of members: give --members too.")
+    if options.nudge is not None and not 0 <= options.nudge < math.inf:
+        raise ConfigError(f"--nudge {options.nudge}: it must be a number of cells, 0 or more, such as 0.1.")
+    writer = find_writer("--out", options.out)
+    for path in writer.paths(options.out, options.members or 0):
+        find_writer("--out", path)
 
 
 def _thrown_state(model: Pretrained, options: argparse.Namespace) -> Particles:
@@ -161,7 +203,7 @@ def _thrown_state(model: Pretrained, options: argparse.Namespace) -> Particles:
         raise ConfigError(f"--particles {options.particles}{blocks}: {error}") from error
 
 
-def _predict(
+def predict(
     model: Pretrained,
     state: Particles,
     prescribed: Prescribed | None,
@@ -175,18 +217,49 @@ def _predict(
     from nmpm.emulator.input_checks import warn_of_start_outside
     from nmpm.emulator.monitor import Monitor, Policy
 
-    monitor, parts, first, steps = Monitor(Policy(options.watch)), [], between - 1, frames * between
+    monitor, parts, steps = Monitor(Policy(options.watch)), [], frames * between
     start, given = state.to(model.emulator.device), prescribed and prescribed.to(model.emulator.device)
     warn_of_start_outside(model.emulator, start)
     with progress_bar("rollout", -(-steps // model.emulator.frames)) as step:
-        for bundle in stream_rollout(model.emulator, start, steps, monitor, given):
-            kept = slice(first, None, between)
-            fields = {name: values[:, kept].cpu() for name, values in bundle.fields.items()}
-            parts.append(Rollout(bundle.position[:, kept].cpu(), fields))
-            first = (first - bundle.position.shape[1]) % between
+        for part in kept_frames(stream_rollout(model.emulator, start, steps, monitor, given), between):
+            parts.append(part)
             step()
     sys.stdout.write(monitor.report() + "\n")
     return Rollout.join(parts)
+
+
+def kept_frames(parts: Iterable[Rollout], between: int) -> Iterator[Rollout]:
+    """Every `between`-th frame of the parts of a rollout, on the CPU."""
+    first = between - 1
+    for part in parts:
+        kept = slice(first, None, between)
+        fields = {name: values[:, kept].cpu() for name, values in part.fields.items()}
+        yield part._replace(position=part.position[:, kept].cpu(), fields=fields)
+        first = (first - part.position.shape[1]) % between
+
+
+def trajectory_of(
+    model: Pretrained,
+    scene: Scene,
+    start: Particles,
+    rollout: Rollout,
+    window: Window | None,
+    options: argparse.Namespace,
+) -> Trajectory:
+    """The start and the prediction of one scene, beside what was recorded."""
+    from nmpm.data.predictions import predicted_trajectory
+
+    origin = f"the zoo model {options.model}" if "sha256" in model.card else f"the model {options.model}"
+    return predicted_trajectory(
+        scene,
+        start,
+        rollout.position,
+        origin,
+        fields=rollout.fields,
+        truth=None if window is None else window.recorded[:, : rollout.position.shape[1] + 2],
+        real=None if window is None else window.mask,
+        obstacle_frames=None if window is None else window.obstacle_frames,
+    )
 
 
 def _write(
@@ -199,39 +272,11 @@ def _write(
 ) -> str:
     """Write the start and the prediction, beside what was recorded; return how to look at them."""
     from nmpm.data.described import described_metadata
-    from nmpm.data.predictions import predicted_trajectory
 
-    origin = f"the zoo model {options.model}" if "sha256" in model.card else f"the model {options.model}"
     start = state.to("cpu")
-    predicted = predicted_trajectory(
-        scene,
-        start,
-        rollout.position,
-        origin,
-        fields=rollout.fields,
-        truth=None if window is None else window.recorded[:, : rollout.position.shape[1] + 2],
-        real=None if window is None else window.mask,
-        obstacle_frames=None if window is None else window.obstacle_frames,
-    )
+    predicted = trajectory_of(model, scene, start, rollout, window, options)
     metadata = described_metadata(predicted.attributes, options.out, len(predicted.position))
     file = write_trajectory(options.out, predicted, metadata)
     frames = f"2 frames of the start and {rollout.position.shape[1]} predicted"
     sys.stdout.write(f"wrote {frames}, of {start.position.shape[1]} particles, to {file}\n")
     return find_writer("--out", options.out).hint(file)
-
-
-def _print_errors(scene: Scene, bundle: int, window: Window, rollout: Rollout, options: argparse.Namespace) -> None:
-    """Print the errors against a recording beside those of the trivial predictors, over the frames that both have."""
-    from rich.console import Console
-
-    from nmpm.evaluation.comparison import Comparison
-    from nmpm.evaluation.figures import error_table
-    from nmpm.metrics import MSE
-
-    frames = min(window.target.shape[1], rollout.position.shape[1])
-    comparison = Comparison(scene, [MSE()], bundle)
-    fields = {name: values[:, :frames] for name, values in rollout.fields.items()}
-    comparison.update(window.first(frames + 2), rollout.position[:, :frames], fields)
-    figures = {name: float(value) for name, value in comparison.compute().items()}
-    what = f"{options.data}, trajectory {options.trajectory}, {frames} frames:"
-    Console().print(error_table(what, figures))

@@ -57,8 +57,8 @@ def figures_unit(figures: Mapping[str, float]) -> Unit:
     return Unit.of(figures.values() if scale is None else [scale])
 
 
-def error_table(what: str, figures: Mapping[str, float]) -> Table:
-    """The errors of a model beside those of the trivial predictors, in one unit, which the title names.
+def error_table(what: str, figures: Mapping[str, float], predictors: Mapping[str, str] = PREDICTORS) -> Table:
+    """The errors of a model beside those of other predictors, in one unit, which the title names.
 
     MSE at horizons come in order, the full rollout's after them, then the rest.
     """
@@ -70,7 +70,7 @@ def error_table(what: str, figures: Mapping[str, float]) -> Table:
     table.add_column("predictor")
     for name in names:
         table.add_column(name, justify="right")
-    for kind, label in PREDICTORS.items():
+    for kind, label in predictors.items():
         prefix = "" if kind == "model" else f"{kind}/"
         row = [figures.get(prefix + name) for name in names]
         table.add_row(label, *("" if value is None else unit.show(value) for value in row))

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nmpm import Zoo, load_trajectories
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.data.format import Split, read_metadata
@@ -81,3 +82,49 @@ def test_a_rollout_starts_from_data_of_any_form(make_dataset, capsys):
     assert main(["view", "runs/test.npz"]) == 0 == main(["render", "runs", "--split", "train"])
     assert Path("runs/test.html").exists()
     assert Path("runs.gif").exists()
+
+
+def test_members_become_a_trajectory_each_that_is_read_back(folder, make_dataset, capsys):
+    data = make_dataset(test=((22, 9),))
+    assert main(["rollout", "goop", "--data", str(data), "--members", "3", "--seed", "5"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "wrote 3 members of 2 frames of the start and 20 predicted, of 9 particles, to out.h5" in said
+    assert "ms per frame and member" in said
+    assert "a member, mean of 3" in said
+    assert "without noise and nudge" in said
+    members = load_trajectories("out.h5").test
+    assert [int(one.attributes["member"]) for one in members] == [0, 1, 2]
+    model, recorded = Zoo.load("goop"), Split(data / "test.h5").read(0)
+    state = model.start(load_trajectories(data).test[0])
+    expected = model.rollout(state, 20, members=3, seed=5)[:, 0]
+    for member, position in zip(members, expected, strict=True):
+        np.testing.assert_allclose(member.position[2:], position, atol=1e-6)
+        assert 0 < np.abs(member.position[1] - recorded.position[1]).max() < 0.02
+    np.testing.assert_array_equal(Split(folder / "out.h5").fields(2)["truth"], recorded.position)
+    assert main(["view", "out.h5"]) == 0 == main(["render", "out.h5", "--trajectory", "2"])
+
+
+def test_members_become_files_of_their_own_where_a_form_holds_one_trajectory(folder, capsys):
+    few = ["rollout", "goop", "--members", "2", "--frames", "3", "--particles", "20", "--nudge", "0"]
+    Path("new").mkdir()
+    assert main([*few, "--out", "new/out.csv"]) == 0
+    assert "to new/out-0.csv … new/out-1.csv" in capsys.readouterr().out
+    assert Path("new/out-0.csv").read_text() == Path("new/out-1.csv").read_text()
+    assert sorted(path.name for path in Path("new").iterdir()) == ["out-0.csv", "out-1.csv"]
+    Path("out-1.csv").mkdir()
+    assert main([*few, "--out", "out.csv"]) == 1
+    assert "--out out-1.csv: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--members", "0"], "--members 0: it must be at least 1"),
+        (["--members", "2", "--nudge", "-1"], "--nudge -1.0: it must be a number of cells"),
+        (["--nudge", "0.1"], "give --members too"),
+        (["--members", "2", "--seed", "-1"], "--seed -1"),
+    ],
+)
+def test_wrong_members_are_refused_in_one_line(options, message, capsys):
+    assert main(["rollout", "goop", *options]) == 1
+    assert message in capsys.readouterr().err

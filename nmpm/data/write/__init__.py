@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
@@ -57,3 +58,9 @@ def write_trajectory(path: Path, trajectory: Trajectory, metadata: Metadata) -> 
     """Writes a trajectory in the form of the path's suffix; returns the file to open, see `TrajectoryWriter.write`."""
     with progress_bar(f"Writing {path.name}", len(trajectory.position)) as step:
         return find_writer("the file", path).write(path, trajectory, metadata, step)
+
+
+def write_trajectories(path: Path, trajectories: Iterable[Trajectory], metadata: Metadata, frames: int) -> list[Path]:
+    """As `write_trajectory`, several of so many frames in all; the files are `TrajectoryWriter.paths`."""
+    with progress_bar(f"Writing {path.name}", frames) as step:
+        return find_writer("the file", path).write_all(path, trajectories, metadata, step)

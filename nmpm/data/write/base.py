@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -40,6 +40,19 @@ class TrajectoryWriter(abc.ABC):
         Raises:
             DataError or OSError: if it cannot be written.
         """
+
+    def write_all(
+        self, path: Path, trajectories: Iterable[Trajectory], metadata: Metadata, step: Callable[[], object] = no_step
+    ) -> list[Path]:
+        """As `write`, several trajectories into `paths`, each taken when the one before is written."""
+        return [
+            self.write(self.paths(path, number + 1)[-1], trajectory, metadata, step)
+            for number, trajectory in enumerate(trajectories)
+        ]
+
+    def paths(self, path: Path, count: int) -> list[Path]:
+        """The files of so many trajectories: a file for each, out-0.csv, out-1.csv, …, unless one holds them all."""
+        return [path.with_stem(f"{path.stem}-{number}") for number in range(count)]
 
     def obstacle(self, path: Path) -> str:
         """Why nothing can be written to a path, in words; empty if it can."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
@@ -25,12 +25,27 @@ class NativeHdf5(TrajectoryWriter):
     def write(
         self, path: Path, trajectory: Trajectory, metadata: Metadata, step: Callable[[], object] = no_step
     ) -> Path:
-        volume = particle_spacing(trajectory, metadata) ** metadata.dim
-        described = replace(trajectory, attributes=description(trajectory, metadata, volume) | trajectory.attributes)
-        write_viewable(path, [described])
-        for _ in trajectory.position:
-            step()
-        return path
+        return self.write_all(path, [trajectory], metadata, step)[0]
+
+    def write_all(
+        self, path: Path, trajectories: Iterable[Trajectory], metadata: Metadata, step: Callable[[], object] = no_step
+    ) -> list[Path]:
+        write_viewable(path, self._described(trajectories, metadata, step))
+        return [path]
+
+    def paths(self, path: Path, count: int) -> list[Path]:  # noqa: ARG002
+        return [path]
+
+    def _described(
+        self, trajectories: Iterable[Trajectory], metadata: Metadata, step: Callable[[], object]
+    ) -> Iterator[Trajectory]:
+        """The trajectories with attributes that describe their scene; steps once each is written."""
+        for trajectory in trajectories:
+            volume = particle_spacing(trajectory, metadata) ** metadata.dim
+            attributes = description(trajectory, metadata, volume) | trajectory.attributes
+            yield replace(trajectory, attributes=attributes)
+            for _ in trajectory.position:
+                step()
 
     def hint(self, path: Path) -> str:
         return f"nmpm view {path}, or ParaView"
@@ -41,9 +56,12 @@ class VtkHdf(NativeHdf5):
 
     readers: ClassVar[str] = "ParaView, nmpm view"
 
-    def write(
-        self, path: Path, trajectory: Trajectory, metadata: Metadata, step: Callable[[], object] = no_step
-    ) -> Path:
-        velocity = np.stack(list(frame_velocities(trajectory, metadata)))
-        with_velocity = replace(trajectory, fields={"velocity": velocity, **trajectory.fields})
-        return super().write(path, with_velocity, metadata, step)
+    def write_all(
+        self, path: Path, trajectories: Iterable[Trajectory], metadata: Metadata, step: Callable[[], object] = no_step
+    ) -> list[Path]:
+        return super().write_all(path, (_with_velocity(one, metadata) for one in trajectories), metadata, step)
+
+
+def _with_velocity(trajectory: Trajectory, metadata: Metadata) -> Trajectory:
+    velocity = np.stack(list(frame_velocities(trajectory, metadata)))
+    return replace(trajectory, fields={"velocity": velocity, **trajectory.fields})
