@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from statistics import median
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from rich.table import Table
 
@@ -87,3 +87,37 @@ def no_better_than_trivial(figures: Mapping[str, float]) -> str:
         f"The model is no better than a trivial predictor: its error is {with_unit(figures['mse'])}, that of"
         f" '{PREDICTORS[best]}' {with_unit(trivial[best])}. Train it longer, or on more data, before using it."
     )
+
+
+ENSEMBLE_COLUMNS = ("one rollout", "members", "spread over skill", "within 50%", "within 90%")
+"""Of the table of an ensemble's scores: two of the fair CRPS, spread over skill, coverage of central intervals."""
+
+
+def ensemble_rows(ensemble: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
+    """A label and cells below `ENSEMBLE_COLUMNS` for each quantity and frame of `EnsembleTest.to_dict`."""
+    rows = []
+    for name, scores in ensemble["scores"].items():
+        quantity, _, frame = name.partition("@")
+        low, high = (1e3 * value for value in scores["interval"])
+        further = [scores.get(key) for key in ("spread_skill", "coverage50", "coverage90")]
+        cells = [f"{1e3 * scores['single']:.3g}", f"{1e3 * scores['crps']:.3g} ({low:.3g} – {high:.3g})"]
+        cells += ["" if value is None else f"{value:.2f}" for value in further]
+        rows.append((f"{quantity}, {f'frame {frame}' if frame else 'last frame'}", cells))
+    return rows
+
+
+def ensemble_title(ensemble: Mapping[str, Any]) -> str:
+    """What a table of scores shows, such as "fair CRPS ×10⁻³ of 8 members"."""
+    nudged = f", starts displaced by {ensemble['nudge']:g} cells" if "nudge" in ensemble else ""
+    return f"fair CRPS ×10⁻³ of {ensemble['members']} members{nudged}"
+
+
+def ensemble_table(what: str, ensemble: Mapping[str, Any]) -> Table:
+    """The scores of an ensemble beside those of one rollout."""
+    table = Table(title=f"{what} {ensemble_title(ensemble)}")
+    table.add_column("quantity")
+    for name in ENSEMBLE_COLUMNS:
+        table.add_column(name, justify="right")
+    for label, cells in ensemble_rows(ensemble):
+        table.add_row(label, *cells)
+    return table

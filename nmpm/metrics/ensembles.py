@@ -139,6 +139,7 @@ class EnsembleScores:
     Args:
         scene: Of all of them.
         frames: Predicted frames of the data that are scored, beside the last one, as far as trajectories are as long.
+        every: Frames of the data per frame of the windows, where a model skips some.
 
     Attributes:
         rows: Scores of each scene by the names of `compute`. In place of the ratio "spread_skill_…" they hold its two
@@ -147,8 +148,8 @@ class EnsembleScores:
             truth and all members have the same density, as empty ones, do not count.
     """
 
-    def __init__(self, scene: Scene, frames: Sequence[int] = (32, 100, 200)) -> None:
-        self.scene, self.frames = scene, tuple(frames)
+    def __init__(self, scene: Scene, frames: Sequence[int] = (32, 100, 200), every: int = 1) -> None:
+        self.scene, self.frames, self.every = scene, tuple(frames), every
         self.rows: list[dict[str, float]] = []
         self.ranks: dict[str, Tensor] = {}
         self._generator = torch.Generator().manual_seed(0)
@@ -163,7 +164,8 @@ class EnsembleScores:
         """
         observed, window = window.observed_targets, window.at_observed()
         last = len(observed)
-        ends = {f"@{frame}": frame for frame in self.frames if frame < last} | {"": last}
+        reached = {f"@{frame}": frame // self.every for frame in self.frames}
+        ends = {name: end for name, end in reached.items() if 0 < end < last} | {"": last}
         wanted = {end - back for end in ends.values() for back in (0, 1)}
         squared, kept = _consume(window, members, observed, wanted)
         row = {f"mse{name}": float(squared[:end].nanmean()) for name, end in ends.items()}

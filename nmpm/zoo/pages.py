@@ -15,7 +15,15 @@ from nmpm._support.bounded_files import read_yaml
 from nmpm._support.messages import one_line
 from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import DataError, ZooError
-from nmpm.evaluation.figures import PREDICTORS, Unit, figures_unit, with_unit
+from nmpm.evaluation.figures import (
+    ENSEMBLE_COLUMNS,
+    PREDICTORS,
+    Unit,
+    ensemble_rows,
+    ensemble_title,
+    figures_unit,
+    with_unit,
+)
 from nmpm.zoo.card import FACTOR, fastest_time, lifecycle, stated_milliseconds, trivial_error
 from nmpm.zoo.entries import CONFIG, read_card, read_recipe
 
@@ -46,7 +54,7 @@ QUALITY = {
 }
 """Further errors: name, factor and unit, by their key in the card."""
 OPTIONAL = (
-    *("about", "twin", "floor", "quality", "speed", "trade", "stress", "stress_free"),
+    *("about", "twin", "floor", "quality", "ensemble", "speed", "trade", "stress", "stress_free"),
     *("failures", "weights", "license", "sha256"),
 )
 """Keys that a card may lack."""
@@ -86,6 +94,7 @@ def entry_page(card: Mapping[str, Any], files: Collection[str] = (), load: str |
         load: What `Zoo.load` takes; the model's name when left out.
     """
     unit, count = figures_unit(card["test"]), card["test_scenes"]
+    ensemble = card["ensemble"] if "scores" in (card.get("ensemble") or {}) else None
     return _TEMPLATES.get_template("entry.md").render(
         card={**dict.fromkeys(OPTIONAL), **card},
         state=lifecycle(card),
@@ -97,6 +106,9 @@ def entry_page(card: Mapping[str, Any], files: Collection[str] = (), load: str |
         scenes="one test scene" if count == 1 else f"{count} test scenes",
         unstable=(card.get("floor") or {}).get("unstable"),
         quality=list(_quality(card.get("quality") or {})),
+        ensemble=ensemble and ensemble_title(ensemble),
+        ensemble_columns=ENSEMBLE_COLUMNS,
+        ensemble_rows=ensemble and ensemble_rows(ensemble),
         fastest=fastest_time(card),
         training=card["training"],
         constraints=_constraints(card),

@@ -172,6 +172,7 @@ def _card(
         "obstacles": emulator.scene.obstacles,
         **({"particles": figures["particles"]} if figures.get("particles") else {}),
         **simulation,
+        **({"ensemble": figures["ensemble"]} if figures.get("ensemble") else {}),
         "golden": golden_rollout(emulator),
         "versions": figures["versions"],
     }

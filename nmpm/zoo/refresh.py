@@ -16,6 +16,7 @@ from nmpm._support.shipped import user_home
 from nmpm.errors import DataError, ZooError
 from nmpm.zoo.card import CARD
 from nmpm.zoo.entries import load_entry, read_card
+from nmpm.zoo.measures.ensemble import ensemble_facts
 from nmpm.zoo.measures.model import invariant_facts, quality_facts, stress_facts
 from nmpm.zoo.measures.simulator import floor_facts, twin_facts
 from nmpm.zoo.measures.speed import speed_facts
@@ -27,6 +28,7 @@ MEASURES: Mapping[str, Callable[[Pretrained, Path, Path | None], dict[str, Any]]
     {
         "speed": lambda model, folder, _: speed_facts(model, folder),
         "quality": quality_facts,
+        "ensemble": lambda model, _, data: ensemble_facts(model, data),
         "twin": lambda model, _, data: twin_facts(model, data),
         "floor": lambda model, _, data: floor_facts(model, data),
         "stress": lambda model, *_: stress_facts(model),

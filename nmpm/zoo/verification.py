@@ -24,7 +24,8 @@ from nmpm.errors import ZooError
 from nmpm.evaluation.bootstrap import interval
 from nmpm.metrics import MSE
 from nmpm.zoo.entries import Rows, load_entry, read_scenes
-from nmpm.zoo.measures.scenes import iterate_test_scenes
+from nmpm.zoo.measures.ensemble import score_members
+from nmpm.zoo.measures.scenes import iterate_scenes
 from nmpm.zoo.optimization import fitting_count
 from nmpm.zoo.pretrained import Pretrained
 
@@ -83,7 +84,7 @@ def verify(model: Pretrained, rows: Rows, full: bool = False, data: Path | None 
         model: With its card.
         rows: The stated errors of its test scenes, in their order.
         full: All test scenes to their end, the mean within the 95% interval over scenes, instead of the first 100
-            frames of the first few, each within 10%.
+            frames of the first few, each within 10%; and the scores of members that the card states.
         data: Folder of recorded data that the model was tested on; simulated scenes need none.
 
     Raises:
@@ -96,7 +97,7 @@ def verify(model: Pretrained, rows: Rows, full: bool = False, data: Path | None 
     yield from _headline(model, rows)
     frames, count = (None, len(rows)) if full else (SHORT_FRAMES, SHORT_SCENES)
     metric = MSE()
-    for window in iterate_test_scenes(f"Verifying {model.name}", model, data, count, frames):
+    for window in iterate_scenes(f"Verifying {model.name}", model, data, count, frames):
         predicted = model.rollout(window.initial, window.target.shape[1], Prescribed.of(window)).cpu()
         metric.update(with_predicted(window, model.emulator.frames), predicted)
     compare = _means if full else _scenes
@@ -105,6 +106,17 @@ def verify(model: Pretrained, rows: Rows, full: bool = False, data: Path | None 
         more = "" if full else "; --full measures the whole scenes"
         raise ZooError(f"{model.name}: no error of a test scene is stated that was measured{more}.")
     yield from checks
+    if full and "scores" in (stated := model.card.get("ensemble") or {}):
+        yield from _members(model, stated, data)
+
+
+def _members(model: Pretrained, stated: Mapping[str, Any], data: Path | None) -> Iterator[Check]:
+    """The fair CRPS of each quantity and frame on the card, which passes within its interval."""
+    scenes = iterate_scenes(f"Verifying members of {model.name}", model, data)
+    measured = score_members(model, scenes, stated["members"], stated.get("nudge")).to_dict()["scores"]
+    for name, scores in stated["scores"].items():
+        crps = measured[name]["crps"] if name in measured else math.nan
+        yield Check(f"fair CRPS of {name}, {stated['members']} members", scores["crps"], crps, *scores["interval"])
 
 
 def _headline(model: Pretrained, rows: Rows) -> Iterator[Check]:

@@ -20,6 +20,7 @@ from nmpm.zoo.measures import simulator
 from nmpm.zoo.measures.simulator import NUDGE, floor_facts, twin_facts
 from nmpm.zoo.pages import entry_page, index_page
 from nmpm.zoo.refresh import add_facts, refresh
+from nmpm.zoo.verification import verify_entry
 
 SHIPPED = shipped_folder("zoo")
 COMPLETE = {
@@ -42,7 +43,7 @@ def entry(root, small, write_entry) -> Path:
 def goop(goop) -> Path:
     """The shipped model with two short test scenes."""
     preset = load_preset("goop").with_frames(10)
-    simulation = {"preset": preset.to_dict(), "counts": {"train": 0, "valid": 0, "test": 2}, "seed": 0}
+    simulation = {"preset": preset.to_dict(), "counts": {"train": 0, "valid": 1, "test": 2}, "seed": 0}
     card = read_yaml(goop / "card.yaml") | {"simulation": simulation | {"revision": preset.revision}}
     (goop / "card.yaml").write_text(yaml.safe_dump(card))
     return goop
@@ -69,6 +70,22 @@ def test_quality_floor_twin_and_pictures_are_on_the_card(goop):
     assert "![the test scene with the largest error](worst.png)" in text
     assert "| the simulator with 6 substeps a frame instead of 12 |" in text
     assert f"(scene {quality['worst']['scene']})" in text
+
+
+def test_scores_of_members_are_on_the_card_and_confirmed(goop):
+    refresh(goop, ["ensemble"])
+    ensemble = Zoo.card("goop", goop.parent)["ensemble"]
+    assert (ensemble["members"], ensemble["nudge"]) == (8, 0.03)  # the least, as nothing is chaotic so early
+    assert set(ensemble["scores"]) == {"density", "front", "height", "kinetic"}
+    for scores in ensemble["scores"].values():
+        assert scores["interval"][0] <= scores["crps"] <= scores["interval"][1]
+        assert 0 <= scores["coverage50"] <= scores["coverage90"] <= 1
+    assert load_model(goop).nudge == 0.03
+    assert "Fair CRPS ×10⁻³ of 8 members, starts displaced by 0.03 cells" in (goop / "README.md").read_text()
+    (goop / "scenes.csv").write_text("mse\n1e-7\n1e-7\n")
+    checks = [check for check in verify_entry(goop, full=True) if "CRPS" in check.name]
+    assert len(checks) == 4
+    assert all(check.passed for check in checks)
 
 
 def nudge_all_but(stable: set[int]):
@@ -197,7 +214,7 @@ def test_an_incomplete_card_gets_one_line_and_nothing_is_rewritten(entry, change
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["small", "--measure", "sped"], "--measure sped: what can be measured is speed, quality, twin, floor, stress"),
+        (["small", "--measure", "sped"], "--measure sped: what can be measured is speed, quality, ensemble, twin"),
         (["--failures", "Dust."], "give the model's NAME too"),
         (["small", "--failures", "Late \x96 dust"], "'Late \\x96 dust' has a control character"),
     ],

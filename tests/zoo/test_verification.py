@@ -13,7 +13,7 @@ from nmpm.errors import ConfigError, ZooError
 from nmpm.evaluation.bootstrap import interval
 from nmpm.zoo import Zoo
 from nmpm.zoo.entries import read_scenes
-from nmpm.zoo.measures.scenes import iterate_test_scenes, simulator_of
+from nmpm.zoo.measures.scenes import iterate_scenes, simulator_of
 from nmpm.zoo.verification import TOLERANCE, golden_distance, verify, verify_entry
 
 SHIPPED = shipped_folder("zoo")
@@ -99,7 +99,7 @@ def test_malformed_tables_of_scenes_are_not_confirmed(root, text):
 
 def test_a_folder_with_other_test_scenes_than_the_cards_is_refused(make_dataset):
     with pytest.raises(ConfigError, match="has other test scenes than the card of goop is of"):
-        next(iterate_test_scenes("x", Zoo.load("goop", SHIPPED), make_dataset(), frames=10))
+        next(iterate_scenes("x", Zoo.load("goop", SHIPPED), make_dataset(), frames=10))
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from nmpm.evaluation.stress import GROUPS, QUICK, ModelUnderTest, TestResult, ba
 from nmpm.particles import Window
 from nmpm.viz import write_snapshots
 from nmpm.zoo.card import stress_digest
-from nmpm.zoo.measures.scenes import iterate_test_scenes, simulator_of
+from nmpm.zoo.measures.scenes import iterate_scenes, simulator_of
 from nmpm.zoo.pretrained import Pretrained
 
 FIRST, WORST = "rollout.png", "worst.png"
@@ -36,7 +36,7 @@ def quality_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[st
     """
     rows: list[dict[str, float]] = []
     worst: tuple[Window, Tensor] | None = None
-    for window in iterate_test_scenes(f"quality of {model.name}", model, data):
+    for window in iterate_scenes(f"quality of {model.name}", model, data):
         predicted = model.rollout(window.initial, window.target.shape[1], Prescribed.of(window)).cpu()
         scored = with_predicted(window, model.emulator.frames)
         rows.append(measure_errors(model.scene, scored, predicted, Measures((), EMD_FRAMES)))

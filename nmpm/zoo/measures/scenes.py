@@ -1,4 +1,4 @@
-"""The test scenes of a model, simulated from their seeds or read from the folder of its data."""
+"""The test and validation scenes of a model, simulated from their seeds or read from the folder of its data."""
 
 from __future__ import annotations
 
@@ -24,8 +24,13 @@ from nmpm.sim import Preset, SimulatedTrajectory, load_preset, preset_from_dict,
 from nmpm.zoo.pretrained import Pretrained
 
 
-def iterate_test_scenes(
-    what: str, model: Pretrained, data: Path | None, count: int | None = None, frames: int | None = None
+def iterate_scenes(
+    what: str,
+    model: Pretrained,
+    data: Path | None,
+    count: int | None = None,
+    frames: int | None = None,
+    split: str = "test",
 ) -> Iterator[Window]:
     """The first test scenes in the order of the card, one at a time, with a progress bar.
 
@@ -35,21 +40,22 @@ def iterate_test_scenes(
         data: Folder of the dataset; simulated scenes need none.
         count: Number of scenes; all when left out.
         frames: Frames to predict; all when left out.
+        split: "valid" for validation scenes, of which there may be fewer.
 
     Raises:
         ConfigError: if they cannot be had: recorded data without `data`, simulated by another revision, or `data` with
             other test scenes than the card's.
         DataError: if the data cannot be read.
     """
-    windows = _simulate(model, frames) if data is None else _read(model, frames, data)
+    windows = _simulate(model, frames, split) if data is None else _read(model, frames, data, split)
     with progress_bar(what, count or int(model.card["test_scenes"])) as advance:
         for window in islice(windows, count):
             yield window
             advance()
 
 
-def _read(model: Pretrained, frames: int | None, data: Path) -> Iterator[Window]:
-    split, metadata = Split(find_split(data, "test")), read_metadata(data, "deepmind")
+def _read(model: Pretrained, frames: int | None, data: Path, name: str) -> Iterator[Window]:
+    split, metadata = Split(find_split(data, name)), read_metadata(data, "deepmind")
     stated, simulated = model.card.get("simulation"), metadata.extra.get("simulation")
     if isinstance(stated, Mapping) and not (isinstance(simulated, Mapping) and same_test_scenes(stated, simulated)):
         raise ConfigError(
@@ -60,11 +66,11 @@ def _read(model: Pretrained, frames: int | None, data: Path) -> Iterator[Window]
         yield window if frames is None else window.first(frames + 2)
 
 
-def _simulate(model: Pretrained, frames: int | None) -> Iterator[Window]:
+def _simulate(model: Pretrained, frames: int | None, split: str) -> Iterator[Window]:
     preset, request = simulation_of(model)
     shorter = preset if frames is None else preset.with_frames(frames + 1)
-    for index in range(request.counts["test"]):
-        seed = request.trajectory_seed("test", index)
+    for index in range(request.counts[split]):
+        seed = request.trajectory_seed(split, index)
         yield collate([as_recording(model, preset, shorter.simulate(seed), seed)], Reading(model.scene))
 
 

@@ -16,7 +16,7 @@ from nmpm.errors import UnstableError
 from nmpm.metrics import MSE
 from nmpm.sim import SimulatedTrajectory
 from nmpm.sim.predictability import nudge, twin_of
-from nmpm.zoo.measures.scenes import as_recording, iterate_test_scenes, simulation_of
+from nmpm.zoo.measures.scenes import as_recording, iterate_scenes, simulation_of
 from nmpm.zoo.pretrained import Pretrained
 
 NUDGE = 1e-6
@@ -70,7 +70,7 @@ def _compare(
     """Mean errors of another simulation of the test scenes from their seeds, and which of them are unstable in it."""
     preset, request = simulation_of(model)
     metric, unstable = MSE(), []
-    for index, window in enumerate(iterate_test_scenes(f"{what} of {model.name}", model, data)):
+    for index, window in enumerate(iterate_scenes(f"{what} of {model.name}", model, data)):
         seed = request.trajectory_seed("test", index)
         try:
             run = simulate(seed)
