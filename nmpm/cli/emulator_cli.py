@@ -208,6 +208,7 @@ class EmulatorCLI(LightningCLI):
             sys.stderr.write(contradictions_warning(self.datamodule.data_source))
 
     def before_validate(self) -> None:
+        self.model.tested_members = self.config_init[self.subcommand].get("members")
         if self.matched is None:
             self._load_checkpoint()
         else:

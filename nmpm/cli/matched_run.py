@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from jsonargparse import Namespace
+from jsonargparse.typing import PositiveInt
 from lightning.pytorch.cli import LightningArgumentParser
 
 from nmpm._support.plain_data import to_plain
@@ -32,17 +33,20 @@ START_FROM = (
     "Model that a new training starts with: a zoo name, a run or a checkpoint. Cells, network, transfer, decoder and"
     " constraints are the model's."
 )
+MEMBERS = "Rollouts of each test scene, whose scores as an ensemble are reported, too: fair CRPS, spread over skill."
 FORM = (*COMPARED, "constraints", "particles_per_cell")
 """Arguments of --model.… that are the model's."""
 
 
 def add_arguments(parser: LightningArgumentParser, command: str) -> None:
-    """Add the options --materials, --stride and --strict, and --start_from of trainings."""
+    """Add the options --materials, --stride and --strict, --start_from of trainings and --members of tests."""
     for name, text in (("materials", MATERIALS), ("stride", STRIDE)):
         parser.add_argument(f"--{name}", type=str | None, default=None, help=text)
     parser.add_argument("--strict", type=bool, default=False, help=STRICT)
     if command == "fit":
         parser.add_argument("--start_from", type=str | None, default=None, help=START_FROM)
+    if command == "test":
+        parser.add_argument("--members", type=PositiveInt | None, default=None, help=MEMBERS)
 
 
 @dataclass(frozen=True)

@@ -252,6 +252,7 @@ OPTIONS = {
     "--materials DATA=MODEL,...": "of a model on data of another kind: which of its materials each of the data's is",
     "--stride K": "likewise: frames of the data for one of the model, such as 2 or 1/4 (default: what matches best)",
     "--strict": "likewise: refuse data whose gravity, frames, particles, speeds or walls are not the model's",
+    "--members N": "test only: score so many rollouts of each scene as an ensemble, too",
     "--seed_everything N": "seed of all random numbers (default: 0)",
     "--print_config": "print the configuration that results, and stop",
 }

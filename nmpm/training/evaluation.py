@@ -10,6 +10,7 @@ from torch import Tensor
 
 from nmpm.emulator import Emulator, Prescribed, Rollout, predict_rollout
 from nmpm.evaluation.comparison import Comparison
+from nmpm.evaluation.ensembles import EnsembleTest
 from nmpm.metrics import MSE, RolloutMetric, overall_error
 from nmpm.particles import Window
 from nmpm.scene import Reading
@@ -31,6 +32,8 @@ class EvaluatedModule(LightningModule):
         threads: How many threads compute them; None for one each. Changes no result.
         compiled: Whether torch compiles the network, so that batches are not computed in parts.
         reading: How the data are read for the emulator; errors count frames of the data.
+        tested_members: Members of which tests measure scores, too; None for none.
+        ensemble: These scores, in tests of members.
     """
 
     def __init__(self, emulator: Emulator, horizon: int, metrics: Sequence[RolloutMetric] | None) -> None:
@@ -40,6 +43,8 @@ class EvaluatedModule(LightningModule):
         self.threads: int | None = None
         self.compiled = False
         self.reading = Reading(emulator.scene)
+        self.tested_members: int | None = None
+        self.ensemble: EnsembleTest | None = None
         reported = [MSE()] if metrics is None else list(metrics)
         cheap = [metric for metric in reported if metric.cheap]
         self.valid_errors = Comparison(emulator.scene, cheap, emulator.frames)
@@ -59,6 +64,9 @@ class EvaluatedModule(LightningModule):
     def test_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
         with torch.autocast(self.device.type, enabled=False):  # in the precision that trained models are used in
             predicted = self._predict(batch)
+            if self.ensemble is not None:
+                for row in range(len(batch.frames)):
+                    self.ensemble.update(batch.scenes([row]), predicted.position[[row]])
         self.test_errors.update(batch, predicted.position, predicted.fields)
         return predicted.position
 
@@ -93,6 +101,8 @@ class EvaluatedModule(LightningModule):
 
     def on_test_epoch_start(self) -> None:
         self.test_errors.reset()
+        if self.tested_members is not None:
+            self.ensemble = EnsembleTest(self.emulator, self.tested_members, every=self.reading.every)
 
     def on_validation_epoch_end(self) -> None:
         errors = self.valid_errors.compute()
@@ -101,4 +111,6 @@ class EvaluatedModule(LightningModule):
         self.log_dict({f"valid/{name}": value for name, value in (errors | {OVERALL: overall}).items()})
 
     def on_test_epoch_end(self) -> None:
+        if self.ensemble is not None:
+            self.ensemble.gather()
         self.log_dict({f"test/{name}": value for name, value in self.test_errors.compute().items()})

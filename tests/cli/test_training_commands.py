@@ -84,14 +84,18 @@ def test_a_path_replaces_the_data_of_every_shipped_configuration(config, make_da
     assert model.emulator.scene == data.scene
 
 
-def test_without_validations_the_last_weights_are_tested(make_dataset):
+def test_without_validations_the_last_weights_are_tested_and_so_are_members(make_dataset, capsys):
     data = [*source("waterdrop.yaml", make_dataset), "--trainer.default_root_dir", "run"]
     words = [*WATERDROP, *data, "--trainer.limit_val_batches", "0"]
     words += ["--resume.every_n_train_steps", "2"]
     assert main(["fit", *words]) == 0
     ended = json.loads(Path("run/report.json").read_text())["test"]
-    assert main(["test", *words, "--ckpt_path", "last"]) == 0
-    assert json.loads(Path("run/report.json").read_text())["test"] == ended
+    assert main(["test", *words, "--ckpt_path", "last", "--members", "2"]) == 0
+    report = json.loads(Path("run/report.json").read_text())
+    assert report["test"] == ended
+    assert report["ensemble"]["members"] == 2
+    assert report["ensemble"]["scores"]["density"]["crps"] >= 0
+    assert "members, starts displaced by 0.1 cells" in " ".join(capsys.readouterr().out.split())
     assert main(["rollout", "run", "--frames", "2", "--particles", "20"]) == 0
 
 

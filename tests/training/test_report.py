@@ -19,7 +19,7 @@ def test_a_model_that_is_no_better_than_a_trivial_predictor_is_said_to_be_so(err
 
 
 EMULATOR = SimpleNamespace(frames=8, parameters=lambda: iter(()))
-MODULE = SimpleNamespace(emulator=EMULATOR, unroll=2, state_dict=dict, threads=None)
+MODULE = SimpleNamespace(emulator=EMULATOR, unroll=2, state_dict=dict, threads=None, ensemble=None)
 
 
 def trainer_on(device: str) -> SimpleNamespace:

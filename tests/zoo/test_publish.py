@@ -9,6 +9,7 @@ from safetensors.torch import load
 from nmpm._support.bounded_files import read_yaml
 from nmpm._support.digests import float32_digest
 from nmpm._support.shipped import PACKAGE, shipped_folder
+from nmpm.emulator.adaptation import with_noise
 from nmpm.errors import ZooError
 from nmpm.training.module import EmulatorModule
 from nmpm.zoo import Zoo, publish
@@ -42,6 +43,23 @@ def test_an_entry_states_errors_training_constraints_and_stress_tests(run, home)
     assert "for 7 steps in 1.5 minutes on a CPU, 32-true. 1,234 parameters, stored in float16." in text
     assert f"To cite it: `nmpm`'s model `goop/mine`, SHA-256 of its weights {model.card['sha256'][:12]}…" in text
     assert "(chart.png)" in text
+
+
+def test_an_entry_of_a_model_that_reads_noise_states_what_its_members_say(run, small, home):
+    module = EmulatorModule.of(with_noise(small), unroll=3)
+    content = {"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams), "nmpm_format": 1}
+    torch.save(content, run / "checkpoints" / "best.ckpt")
+    report = json.loads((run / "report.json").read_text())
+    density = {"crps": 0.0123, "interval": [0.01, 0.02], "single": 0.04, "spread_skill": 0.9}
+    ensemble = {"members": 8, "scores": {"density@100": density | {"coverage50": 0.5, "coverage90": 0.8}}}
+    (run / "report.json").write_text(json.dumps(report | {"ensemble": ensemble}))
+    text = (add(run, "mine") / "README.md").read_text()
+    assert "Fair CRPS ×10⁻³ of 8 members, in units of each quantity" in text
+    assert "| density, frame 100 | 40 | 12.3 (10 – 20) | 0.90 | 0.50 | 0.80 |" in text
+    model = Zoo.load("mine")
+    assert model.card["ensemble"] == ensemble
+    assert model.nudge == 0
+    assert model.emulator.processor.noise > 0
 
 
 def test_names_that_are_taken_and_folders_that_cannot_be_written(run, tmp_path):

@@ -28,7 +28,7 @@ from nmpm.data.loading.evaluation import EvaluationLoader
 from nmpm.data.predictions import predicted_trajectory
 from nmpm.data.write.vtkhdf import write_viewable
 from nmpm.emulator import Rollout
-from nmpm.evaluation.figures import error_table, no_better_than_trivial
+from nmpm.evaluation.figures import ensemble_table, error_table, no_better_than_trivial
 from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.metrics import MSE
 from nmpm.particles import Window
@@ -108,6 +108,8 @@ class ReportWriter(Callback):
         _write_report(folder, figures)
         self._print_progress()
         _print_table(f"{figures['dataset']}: test", figures["test"])
+        if "ensemble" in figures:
+            Console().print(ensemble_table(f"{figures['dataset']}:", figures["ensemble"]))
         curves = {kind: values for kind, (_, values) in errors.items()}
         _write_curves(folder / "errors.csv", curves, pl_module.reading.every)
         if self._first_rollout is not None:
@@ -141,6 +143,7 @@ class ReportWriter(Callback):
             "progress": self.progress,
             "test": errors,
             "remark": no_better_than_trivial(errors),
+            "ensemble": module.ensemble and module.ensemble.to_dict(),
             "simulation": simulation if isinstance(simulation, dict) else None,
             "particles": self._first_rollout and int(self._first_rollout[0].mask[0].sum()),
         }
