@@ -72,10 +72,10 @@ def _parser() -> argparse.ArgumentParser:
         default=[],
         metavar="WHAT",
         help="for the cards: speed (on this machine), quality (earth mover's distance, energy, shape, worst scene),"
-        " ensemble (scores of eight members), twin and floor (the simulator beside itself), stress; invariants: the"
-        " stress tests without the simulator, where its scenes would take hours",
+        " ensemble (scores of eight members), twin and floor (the simulator beside itself), trust (by validation scenes),"
+        " stress; invariants: the stress tests without the simulator, where its scenes would take hours",
     )
-    refresh.add_argument("--data", type=Path, metavar="FOLDER", help="NAME's data; spares simulating its test scenes")
+    refresh.add_argument("--data", type=Path, metavar="FOLDER", help="NAME's data; spares simulating its scenes")
     refresh.add_argument(
         "--failures", metavar="TEXT", help='what is wrong in NAME\'s pictures, for its card ("": nothing is known)'
     )

@@ -11,7 +11,7 @@ a tenth with the recorded scene are, on average, the same.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -242,8 +242,8 @@ def _masked(part: Rollout, there: Tensor, kept: int) -> Rollout:
     return Rollout(position, fields)
 
 
-def calibrate(emulator: Emulator, windows: Iterator[Window]) -> Trust:
-    """The trust of an emulator on recorded scenes, each the only one of a window.
+def calibrate(emulator: Emulator, windows: Iterable[Window], nudge: float | None = None) -> Trust:
+    """The trust of an emulator on recorded scenes, each the only one of a window, with companions of a nudge.
 
     Raises:
         DataError: if there is none.
@@ -252,7 +252,8 @@ def calibrate(emulator: Emulator, windows: Iterator[Window]) -> Trust:
     for window in windows:
         state, frames = window.initial, window.target.shape[1]
         beside, apart = (TrustTracker(emulator.scene, state, Trust()) for _ in range(2))
-        for part in stream_watched(emulator, state, frames, beside):
+        prescribed = Prescribed.of(window)
+        for part in stream_watched(emulator, state, frames, beside, nudge=nudge, prescribed=prescribed):
             recorded = window.target[:, apart.made : beside.made]
             apart.see(torch.stack([part.position, recorded.to(part.position)]))
         members.append(beside.curve[0])

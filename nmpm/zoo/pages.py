@@ -54,7 +54,7 @@ QUALITY = {
 }
 """Further errors: name, factor and unit, by their key in the card."""
 OPTIONAL = (
-    *("about", "twin", "floor", "quality", "ensemble", "speed", "trade", "stress", "stress_free"),
+    *("about", "twin", "floor", "quality", "ensemble", "speed", "trade", "stress", "stress_free", "trust"),
     *("failures", "weights", "license", "sha256"),
 )
 """Keys that a card may lack."""

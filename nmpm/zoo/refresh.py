@@ -17,7 +17,7 @@ from nmpm.errors import DataError, ZooError
 from nmpm.zoo.card import CARD
 from nmpm.zoo.entries import load_entry, read_card
 from nmpm.zoo.measures.ensemble import ensemble_facts
-from nmpm.zoo.measures.model import invariant_facts, quality_facts, stress_facts
+from nmpm.zoo.measures.model import invariant_facts, quality_facts, stress_facts, trust_facts
 from nmpm.zoo.measures.simulator import floor_facts, twin_facts
 from nmpm.zoo.measures.speed import speed_facts
 from nmpm.zoo.pages import CHART, complete_card, draw_chart, entry_page, index_page
@@ -31,6 +31,7 @@ MEASURES: Mapping[str, Callable[[Pretrained, Path, Path | None], dict[str, Any]]
         "ensemble": lambda model, _, data: ensemble_facts(model, data),
         "twin": lambda model, _, data: twin_facts(model, data),
         "floor": lambda model, _, data: floor_facts(model, data),
+        "trust": lambda model, _, data: trust_facts(model, data),
         "stress": lambda model, *_: stress_facts(model),
         "invariants": lambda model, *_: invariant_facts(model),
     }
@@ -62,7 +63,7 @@ def refresh(
     Args:
         folder: Of the entry.
         measures: Of `MEASURES`.
-        data: Folder of the dataset, which spares the simulation of the test scenes; needed for recorded data.
+        data: Folder of the dataset, which spares the simulation of its scenes; needed for recorded data.
         failures: What the entry's pictures show to be wrong in its rollouts, in sentences, for the card; empty to state
             nothing, None to leave what the card states.
         device: Where the speed is measured, as for `Zoo.load`; everything else is measured on the CPU.

@@ -11,6 +11,7 @@ from torch import Tensor
 from nmpm._support.progress import progress_bar
 from nmpm.emulator import Prescribed
 from nmpm.emulator.prescribed import with_predicted
+from nmpm.emulator.trust import calibrate
 from nmpm.evaluation.bootstrap import interval
 from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.evaluation.prediction_errors import Measures, measure_errors
@@ -24,6 +25,8 @@ from nmpm.zoo.pretrained import Pretrained
 FIRST, WORST = "rollout.png", "worst.png"
 """Pictures of the first test scene and of that with the largest error."""
 EMD_FRAMES = 3
+TRUST_SCENES = 10
+"""Most validation scenes that trust is calibrated on."""
 _SETTLING = "settling"
 
 
@@ -54,6 +57,12 @@ def quality_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[st
             quality[name] = [float(np.mean(values)), *interval(values)]
     index = int(np.argmax([row["mse"] for row in rows]))
     return {"quality": quality | {"worst": {"scene": index, "mse": rows[index]["mse"]}}}
+
+
+def trust_facts(model: Pretrained, data: Path | None) -> dict[str, Any]:
+    """The key `trust` of a card, see `nmpm.emulator.trust.Trust`, calibrated on the validation scenes."""
+    windows = iterate_scenes(f"trust of {model.name}", model, data, TRUST_SCENES, split="valid")
+    return {"trust": calibrate(model.emulator, windows).to_card()}
 
 
 def stress_facts(model: Pretrained) -> dict[str, Any]:
