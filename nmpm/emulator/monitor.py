@@ -71,6 +71,7 @@ class Monitor:
         peaks: The largest value of each measure in this rollout, by the names that incidents have.
         at_walls: Particles at the scene's walls or beyond, when crowding was last measured.
         rest_share: Mean share of the particles that a bundle leaves where they were, as `rest_speed` does.
+        trust: A sentence about the last trusted frame; empty where members are not watched, see `nmpm.emulator.trust`.
     """
 
     policy: Policy = Policy.WARN
@@ -82,6 +83,7 @@ class Monitor:
     peaks: dict[str, float] = field(default_factory=dict)
     at_walls: int = 0
     rest_share: float = 0.0
+    trust: str = ""
     _frames: int = 0
     _last_frame: float = math.inf
     _bundles: int = 0
@@ -95,7 +97,7 @@ class Monitor:
         """Reset, for a rollout of so many frames, or of whole bundles, from a state."""
         self._last_frame = math.inf if frames is None else frames
         self.incidents, self.peaks, self.at_walls, self._frames, self._bundles = [], {}, 0, 0, 0
-        self.rest_share, self._judged = 0.0, 0
+        self.rest_share, self._judged, self.trust = 0.0, 0, ""
         self._unread = []
         self._padded = not is_eager_cpu(particles.mask) or not bool(particles.mask.all())
         if not emulator.scene.gravity_known or not emulator.scene.is_closed:
@@ -206,4 +208,5 @@ class Monitor:
         seen = ", ".join(f"{what} {value:.3g}" for what, value in self.peaks.items() if what != "not finite")
         passed = "; ".join(map(str, self.incidents)) or "none"
         still = f"{self.at_walls} particles at the walls, {self.rest_share:.0%} of all at rest on average"
-        return f"{self._frames} frames; most: {seen}; {still}. Limits passed: {passed}."
+        trust = f" {self.trust}" if self.trust else ""
+        return f"{self._frames} frames; most: {seen}; {still}. Limits passed: {passed}.{trust}"

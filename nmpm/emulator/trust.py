@@ -203,20 +203,17 @@ def stream_watched(
     A single rollout, of which nothing changes, is compared with `COMPANIONS` that start nearby: three cost about three
     times as much. Of members, at least 2, each is compared with each.
     """
-    scenes = len(state.position)
-    if members is not None and members > 1:
-        for part in stream_members(emulator, state, frames, members, seed, nudge, prescribed, monitor):
-            tracker.see(part.position.unflatten(0, (members, scenes)))
-            yield part
-        return
     if members is None:
-        single = stream_rollout(emulator, state, frames, monitor, prescribed)
+        streams = [stream_rollout(emulator, state, frames, monitor, prescribed)]
     else:
-        single = stream_members(emulator, state, frames, 1, seed, nudge, prescribed, monitor)
-    others = stream_members(emulator, state, frames, COMPANIONS, seed + 1, nudge, prescribed)
-    for part, beside in zip(single, others, strict=True):
-        tracker.see(torch.cat([part.position, beside.position]).unflatten(0, (1 + COMPANIONS, scenes)))
-        yield part
+        streams = [stream_members(emulator, state, frames, members, seed, nudge, prescribed, monitor)]
+    if members is None or members == 1:
+        streams.append(stream_members(emulator, state, frames, COMPANIONS, seed + 1, nudge, prescribed))
+    for parts in zip(*streams, strict=True):
+        tracker.see(torch.cat([part.position for part in parts]).unflatten(0, (-1, len(state.position))))
+        if monitor is not None:
+            monitor.trust = tracker.report()
+        yield parts[0]
 
 
 def until_trusted(parts: Iterator[Rollout], tracker: TrustTracker) -> Iterator[Rollout]:

@@ -8,6 +8,7 @@ import torch
 from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.emulator import predict_rollout
 from nmpm.emulator.members import predict_members
+from nmpm.emulator.monitor import Monitor, Policy
 from nmpm.emulator.trust import Trust, TrustTracker, calibrate, frames_below, stream_watched, until_trusted
 from nmpm.errors import DataError
 from tests.scenes import box, cloud, emulator_of, window_of
@@ -91,6 +92,16 @@ def test_a_rollout_until_it_is_trusted_is_the_beginning_of_the_full_one():
     assert torch.equal(ended, full[:, : ended.shape[1]])
     whole, _ = rollout_until_trusted(emulator, state, 10, Trust(limit=1.0))
     assert torch.equal(whole, full[:, :10])
+
+
+def test_a_monitor_reports_the_last_trusted_frame():
+    (emulator, state), monitor = wild(), Monitor(Policy.RECORD)
+    tracker = TrustTracker(SCENE, state, Trust(limit=0.05, scenes=8))
+    list(stream_watched(emulator, state, 60, tracker, monitor=monitor))
+    assert "this scene is one of many" in tracker.report()
+    assert monitor.report().endswith(tracker.report())
+    predict_rollout(emulator, state, 4, monitor)
+    assert "trust" not in monitor.report().lower()
 
 
 def test_scenes_that_are_lost_earlier_are_nan_from_then_on():
