@@ -22,10 +22,11 @@ from nmpm.cli.rollout import kept_frames, trajectory_of
 from nmpm.data.described import described_metadata
 from nmpm.data.format import Trajectory
 from nmpm.data.write import find_writer, write_trajectories
-from nmpm.emulator import Prescribed, Rollout, stream_members
+from nmpm.emulator import Prescribed, Rollout
 from nmpm.emulator.input_checks import warn_of_start_outside
 from nmpm.emulator.members import member_starts
 from nmpm.emulator.monitor import Monitor, Policy
+from nmpm.emulator.trust import TrustTracker, stream_watched
 from nmpm.evaluation.figures import PREDICTORS, error_table
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
@@ -77,7 +78,10 @@ class MemberRollouts:
         state, given = self.state.to(emulator.device), self.prescribed and self.prescribed.to(emulator.device)
         warn_of_start_outside(emulator, state)
         monitor, steps = Monitor(Policy(self.options.watch)), self.frames * self.between
-        stream = stream_members(emulator, state, steps, members, self.options.seed, self._nudge, given, monitor)
+        tracker = TrustTracker(emulator.scene, state, self.model.trust)
+        stream = stream_watched(
+            emulator, state, steps, tracker, members, self.options.seed, self._nudge, given, monitor
+        )
         times = []
         with progress_bar(f"{members} members", -(-steps // emulator.frames)) as step:
             for part in kept_frames(stream, self.between):

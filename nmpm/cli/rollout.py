@@ -53,6 +53,8 @@ examples:
   nmpm rollout runs/goop/checkpoints/last.ckpt
   nmpm rollout goop --out splash.usda                    for Blender; .vtkhdf for ParaView, .csv, …
   nmpm rollout goop --device cuda                        on a GPU, by CUDA graphs
+  nmpm rollout waterramps --until trusted                as far as it predicts this scene
+  nmpm rollout waterramps --fallback waterramps          and on from there by the simulator
   nmpm rollout waterramps --members 8                    eight futures from one start, a trajectory each
 """
 
@@ -148,6 +150,10 @@ def _parser() -> argparse.ArgumentParser:
         metavar="CELLS",
         help="standard deviation of the displacements of members' starts (default: the model's, see nmpm zoo card)",
     )
+    parser.add_argument("--until", choices=["trusted"], help="end with the last frame that is trusted, see the how-to")
+    parser.add_argument(
+        "--fallback", metavar="PRESET", help="simulate the frames after the last trusted one, see nmpm simulate --list"
+    )
     parser.add_argument("--particles", type=int, default=1000, help="approximate number to throw (default: 1000)")
     parser.add_argument("--blocks", type=int, help="number of blocks (default: one of each material)")
     parser.add_argument(
@@ -185,6 +191,8 @@ def _check(options: argparse.Namespace) -> None:
 def _check_members(options: argparse.Namespace) -> None:
     """Check the numbers of members, and that all files can be written."""
     check_at_least("--members", options.members, 1)
+    if options.members is not None and (options.until or options.fallback):
+        raise ConfigError("--until and --fallback are about one rollout: leave --members out.")
     if options.nudge is not None and options.members is None:
         raise ConfigError(f"--nudge {options.nudge} displaces the starts of members: give --members too.")
     if options.nudge is not None and not 0 <= options.nudge < math.inf:
@@ -212,6 +220,10 @@ def predict(
     between: int = 1,
 ) -> Rollout:
     """So many frames, of which the model makes `between` each; all but every last of them are left out."""
+    if options.until or options.fallback:
+        from nmpm.cli.trusted_rollout import predict_trusted
+
+        return predict_trusted(model, state, prescribed, frames, options, between)
     from nmpm._support.progress import progress_bar
     from nmpm.emulator import Rollout, stream_rollout
     from nmpm.emulator.input_checks import warn_of_start_outside

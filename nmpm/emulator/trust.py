@@ -51,7 +51,7 @@ class Trust:
         scenes: Validation scenes of the calibration; 0 where there was none, and limit and error are `waterramps`'.
     """
 
-    limit: float = 0.057
+    limit: float = 0.053
     error: float = 0.2
     scenes: int = 0
 
@@ -126,11 +126,11 @@ class TrustTracker:
         self._scene, self._grid = scene, _counting_grid(scene)
         self._values = functional.one_hot(state.material, len(scene.materials)) * state.present_volume.unsqueeze(-1)
         self._values = self._values.to(torch.float32)
-        self.frames = torch.zeros(len(state.position), dtype=torch.int64)
-        self._lost = torch.zeros(len(state.position), dtype=torch.bool)
-        shape = tuple(-(-cells // _REGION) for cells in self._grid.shape)
-        self.regions = torch.zeros(len(state.position), *shape, dtype=torch.int64)
-        self._lost_regions = torch.zeros_like(self.regions, dtype=torch.bool)
+        scenes = len(state.position)
+        shape = (scenes, *(-(-cells // _REGION) for cells in self._grid.shape))
+        self.frames, self.regions = torch.zeros(scenes, dtype=torch.int64), torch.zeros(shape, dtype=torch.int64)
+        self._lost, self._lost_regions = self.frames.bool(), self.regions.bool()
+        self._last, self._last_regions = torch.zeros(scenes), torch.zeros(shape)
         self._curves: list[Tensor] = []
 
     @property
@@ -139,32 +139,36 @@ class TrustTracker:
         return torch.cat(self._curves, dim=1)
 
     def see(self, members: Tensor) -> None:
-        """Take in the next frames of M members, (M, B, T, N, D)."""
-        apart, total = self._differences(members)
-        curve = (apart.flatten(2).sum(2) / total.flatten(2).sum(2).clamp(min=1e-12)).cpu()
+        """Take in the next frames of M members, (M, B, T, N, D).
+
+        The last of them is measured, as counting costs as much as predicting; in between, disagreement is interpolated.
+        """
+        apart, total = self._differences(members[:, :, -1])
+        last = (apart.flatten(1).sum(1) / total.flatten(1).sum(1).clamp(min=1e-12)).cpu()
+        curve = _ramp(self._last, last, members.shape[2])
         regions = self._by_region(apart, total).cpu()
-        for frame in range(curve.shape[1]):
-            self._lost |= curve[:, frame] > self.trust.limit
-            self._lost_regions |= regions[:, frame] > self.trust.limit
+        for now, in_regions in zip(curve, _ramp(self._last_regions, regions, len(curve)), strict=True):
+            self._lost |= now > self.trust.limit
+            self._lost_regions |= in_regions > self.trust.limit
             self.frames += ~self._lost
             self.regions += ~self._lost_regions
-        self.made += curve.shape[1]
-        self._curves.append(curve)
+        self._last, self._last_regions = last, regions
+        self.made += len(curve)
+        self._curves.append(curve.T)
 
     def _differences(self, members: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, T, *S) mean over pairs of the members of |a - b| and of a + b, a the material in a cell of one."""
-        count, batch, frames = members.shape[:3]
-        there = members.isfinite().all(-1)
-        values = self._values[:, None] * there.unsqueeze(-1)
-        rows = members.nan_to_num().flatten(0, 2)
-        fields = Linear().p2g(values.flatten(0, 2), self._grid.to_cells(rows), self._grid)
-        fields = fields.view(count, batch, frames, -1, *self._grid.shape)
+        """(B, *S) means over pairs of members (M, B, N, D) of |a - b| and of a + b, a the material in a cell of one."""
+        count, batch = members.shape[:2]
+        values = self._values * members.isfinite().all(-1, keepdim=True)
+        rows = members.nan_to_num().flatten(0, 1)
+        fields = Linear().p2g(values.flatten(0, 1), self._grid.to_cells(rows), self._grid)
+        fields = fields.view(count, batch, -1, *self._grid.shape)
         rank = torch.arange(1 - count, count, 2, dtype=fields.dtype, device=fields.device)  # Σ_{i<j} |x_i - x_j|
         apart = torch.tensordot(rank, fields.sort(dim=0).values, dims=1) / (count * (count - 1) / 2)
-        return apart.sum(2), 2 * fields.mean(0).sum(2)
+        return apart.sum(1), 2 * fields.mean(0).sum(1)
 
     def _by_region(self, apart: Tensor, total: Tensor) -> Tensor:
-        """(B, T, *R) disagreement in each region; 0 where it holds less than a cell full of material."""
+        """(B, *R) disagreement in each region; 0 where it holds less than a cell full of material."""
         sums = [_sum_blocks(values, self._grid.dim) for values in (apart, total)]
         full = 2 * self._grid.cell_volume / self._scene.particle_volume
         return torch.where(sums[1] > full, sums[0] / sums[1].clamp(min=full), 0.0)
@@ -174,8 +178,14 @@ class TrustTracker:
         return self.trust.line(int(self.frames.min()), self.made)
 
 
+def _ramp(before: Tensor, after: Tensor, frames: int) -> Tensor:
+    """(T, …) values from those before the first frame to those of the last, linearly."""
+    share = torch.arange(1, frames + 1, dtype=torch.float32).view(-1, *(1,) * after.dim()) / frames
+    return torch.lerp(before, after, share)
+
+
 def _sum_blocks(values: Tensor, dim: int) -> Tensor:
-    """Sums (B, T, *R) over blocks of `_REGION` cells along each of the last axes of (B, T, *S)."""
+    """Sums (B, *R) over blocks of `_REGION` cells along each of the last axes of (B, *S)."""
     for axis in range(-dim, 0):
         padding = [0, 0] * (-axis - 1) + [0, -values.shape[axis] % _REGION]
         values = functional.pad(values, padding).unflatten(axis, (-1, _REGION)).sum(axis)

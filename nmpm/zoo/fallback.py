@@ -23,7 +23,7 @@ from nmpm.particles import Particles
 from nmpm.scene import Interval, Scene
 from nmpm.sim import InitialState, Preset
 from nmpm.sim.mpm.mixture import MpmMixture
-from nmpm.sim.state import Array
+from nmpm.sim.state import Array, Progress
 
 _SAME = 1e-3
 """Relative difference up to which lengths, volumes and times of model and preset are the same."""
@@ -64,7 +64,14 @@ def predict_and_simulate(
     return simulate_rest(emulator.scene, state, trusted, preset, frames)
 
 
-def simulate_rest(scene: Scene, state: Particles, rollout: Rollout, preset: Preset, frames: int) -> Rollout:
+def simulate_rest(
+    scene: Scene,
+    state: Particles,
+    rollout: Rollout,
+    preset: Preset,
+    frames: int,
+    progress: Progress | None = None,
+) -> Rollout:
     """All of so many frames, those that are not trusted simulated by a preset.
 
     Args:
@@ -73,6 +80,7 @@ def simulate_rest(scene: Scene, state: Particles, rollout: Rollout, preset: Pres
         rollout: From `predict_trusted`.
         preset: The simulator.
         frames: How many in all.
+        progress: Called after each simulated frame.
 
     Raises:
         UnstableError: if a simulation becomes unstable.
@@ -85,7 +93,7 @@ def simulate_rest(scene: Scene, state: Particles, rollout: Rollout, preset: Pres
             path = torch.cat([state.position[index, None], position[index, :last]])
             velocity = state.velocity[index] if last == 0 else path[-1] - path[-2]
             start = state.scenes([index]).with_motion(path[-1:], velocity[None].to(path))
-            position[index, last:] = simulate_on(scene, start, preset, frames - last).to(position)
+            position[index, last:] = simulate_on(scene, start, preset, frames - last, progress).to(position)
     return Rollout(position, {}, rollout.trusted)
 
 
@@ -135,7 +143,9 @@ def _obstacle(state: Particles, index: int) -> Array:
     return state.obstacle[index, state.obstacle_mask[index]].cpu().double().numpy()
 
 
-def simulate_on(scene: Scene, state: Particles, preset: Preset, frames: int) -> Tensor:
+def simulate_on(
+    scene: Scene, state: Particles, preset: Preset, frames: int, progress: Progress | None = None
+) -> Tensor:
     """(frames, N, D) positions that a preset makes of the only scene of a state, whose own frame is not among them.
 
     Positions and velocities are the state's, strain and pressure start anew. Padding is NaN.
@@ -145,7 +155,7 @@ def simulate_on(scene: Scene, state: Particles, preset: Preset, frames: int) -> 
     """
     start, order = _initial_state(scene, state, preset)
     try:
-        made = preset.simulate_from(start, frames).position[1:, : len(order)]
+        made = preset.simulate_from(start, frames, progress).position[1:, : len(order)]
     except UnstableError as error:
         raise UnstableError(f"fallback: {preset.name}, from the last trusted frame on: {error}") from error
     simulated = torch.full((frames, *state.position.shape[1:]), torch.nan)

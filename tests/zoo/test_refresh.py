@@ -268,3 +268,15 @@ def test_the_page_of_the_shipped_zoo_is_made_of_its_cards():
 )
 def test_the_lifecycle_follows_from_the_figures(card, state):
     assert lifecycle(card) == state
+
+
+def test_trust_is_calibrated_on_the_validation_scenes(goop):
+    card = Zoo.card("goop", goop.parent)
+    add_facts(
+        goop, card["sha256"], {"simulation": card["simulation"] | {"counts": {"train": 0, "valid": 2, "test": 2}}}
+    )
+    assert main(["zoo", "refresh", "goop", "--measure", "trust", "--root", str(goop.parent)]) == 0
+    model = load_model(goop)
+    assert model.trust.scenes == 2
+    assert model.trust.to_card() == model.card["trust"]
+    assert "in 68% of 2 validation scenes" in (goop / "README.md").read_text()

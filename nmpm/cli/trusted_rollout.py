@@ -1,0 +1,90 @@
+"""`nmpm rollout --until trusted`, and `--fallback PRESET`: a simulator goes on from the last trusted frame."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+
+from nmpm._support.progress import progress_bar
+from nmpm.cli.rollout import kept_frames
+from nmpm.emulator import Prescribed, Rollout
+from nmpm.emulator.input_checks import warn_of_start_outside
+from nmpm.emulator.monitor import Monitor, Policy
+from nmpm.emulator.trust import TrustTracker, stream_watched, until_trusted
+from nmpm.errors import ConfigError
+from nmpm.particles import Particles
+from nmpm.sim import Preset, load_preset
+from nmpm.zoo import Pretrained
+from nmpm.zoo.fallback import fitting_preset, simulate_rest
+
+
+def predict_trusted(
+    model: Pretrained,
+    state: Particles,
+    prescribed: Prescribed | None,
+    frames: int,
+    options: argparse.Namespace,
+    between: int = 1,
+) -> Rollout:
+    """The frames that are trusted, of so many at most; with a fallback all, those that follow simulated.
+
+    Args:
+        model: The model.
+        state: Of one scene.
+        prescribed: What moves or enters as recorded.
+        frames: How many to write at most.
+        options: Of the command.
+        between: Frames of the model per written frame.
+
+    Raises:
+        ConfigError: if the fallback does not fit, or no frame is trusted and there is none.
+    """
+    preset = _fallback(model, state, prescribed, options, between)
+    start, given = state.to(model.emulator.device), prescribed and prescribed.to(model.emulator.device)
+    warn_of_start_outside(model.emulator, start)
+    tracker, monitor = TrustTracker(model.scene, start, model.trust), Monitor(Policy(options.watch))
+    watched = stream_watched(
+        model.emulator, start, frames * between, tracker, nudge=model.nudge, prescribed=given, monitor=monitor
+    )
+    trusted = _join(model, kept_frames(until_trusted(watched, tracker), between), frames * between)
+    sys.stdout.write(f"{monitor.report()}\n")
+    if preset is not None:
+        return _simulate_rest(model, state, trusted._replace(trusted=tracker.frames), preset, frames)
+    if not trusted.position.shape[1]:
+        raise ConfigError(f"--until trusted: no frame is. {tracker.report()} Without it, all are written.")
+    return trusted
+
+
+def _fallback(
+    model: Pretrained, state: Particles, prescribed: Prescribed | None, options: argparse.Namespace, between: int
+) -> Preset | None:
+    """The preset of --fallback, if there is one, checked before any work."""
+    if options.fallback is None:
+        return None
+    if prescribed is not None or between > 1:
+        raise ConfigError(
+            f"--fallback {options.fallback}: a simulator goes on from what moves freely, in the model's own frames; "
+            + ("these data prescribe motion." if prescribed is not None else "--stride asks for others.")
+        )
+    return fitting_preset(model.scene, state, load_preset(options.fallback))
+
+
+def _join(model: Pretrained, parts: Iterator[Rollout], steps: int) -> Rollout:
+    joined = []
+    with progress_bar("rollout", -(-steps // model.emulator.frames)) as step:
+        for part in parts:
+            joined.append(part)
+            step()
+    return Rollout.join(joined)
+
+
+def _simulate_rest(model: Pretrained, state: Particles, trusted: Rollout, preset: Preset, frames: int) -> Rollout:
+    """All frames; says which of them are simulated."""
+    made = trusted.position.shape[1]
+    if made == frames:
+        return trusted
+    with progress_bar(f"Simulating {preset.name}", frames - made) as step:
+        whole = simulate_rest(model.scene, state.to("cpu"), trusted, preset, frames, lambda _: step())
+    sys.stdout.write(f"frames {made + 1} to {frames} are simulated by {preset.name} ({preset.generator})\n")
+    return whole
