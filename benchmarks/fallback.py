@@ -23,7 +23,7 @@ from nmpm.particles import Window
 from nmpm.scene import Scene
 from nmpm.zoo import Pretrained, load_model
 from nmpm.zoo.fallback import fitting_preset, predict_trusted, simulate_on
-from nmpm.zoo.measures.scenes import iterate_test_scenes, simulator_of
+from nmpm.zoo.measures.scenes import iterate_scenes, simulator_of
 
 COLUMNS = ("MSE ×10⁻³", "field, mean", "field, last")
 
@@ -38,7 +38,7 @@ def main(words: list[str] | None = None) -> None:
     options = parser.parse_args(words)
     torch.set_num_threads(1)
     model = load_model(options.model)
-    scenes = iterate_test_scenes("fallback", model, options.data, options.scenes, options.frames)
+    scenes = iterate_scenes("fallback", model, options.data, options.scenes, options.frames)
     rows = [row for window in scenes if (row := measured(model, window)) is not None]
     if not rows:
         sys.stdout.write("no scene is lost\n")
@@ -66,7 +66,7 @@ def measured(model: Pretrained, window: Window) -> dict[str, float | list[float]
     begun = time.process_time()
     alone = model.rollout(state, frames)
     single = time.process_time() - begun
-    trusted = predict_trusted(model.emulator, model.trust, state, frames, nudge=model.nudge)
+    trusted = predict_trusted(model.emulator, model.trust, state, frames)
     watched, last = time.process_time() - begun - single, int(trusted.trusted[0])
     if last in (0, frames):
         return None

@@ -44,9 +44,7 @@ def predict_trusted(
     start, given = state.to(model.emulator.device), prescribed and prescribed.to(model.emulator.device)
     warn_of_start_outside(model.emulator, start)
     tracker, monitor = TrustTracker(model.scene, start, model.trust), Monitor(Policy(options.watch))
-    watched = stream_watched(
-        model.emulator, start, frames * between, tracker, nudge=model.nudge, prescribed=given, monitor=monitor
-    )
+    watched = stream_watched(model.emulator, start, frames * between, tracker, prescribed=given, monitor=monitor)
     trusted = _join(model, kept_frames(until_trusted(watched, tracker), between), frames * between)
     sys.stdout.write(f"{monitor.report()}\n")
     if preset is not None:

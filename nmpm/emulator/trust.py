@@ -210,15 +210,15 @@ def stream_watched(
 ) -> Iterator[Rollout]:
     """Predict as `stream_rollout`, or as `stream_members`, while a tracker watches how far the rollouts part.
 
-    A single rollout, of which nothing changes, is compared with `COMPANIONS` that start nearby: three cost about three
-    times as much. Of members, at least 2, each is compared with each.
+    A single rollout, of which nothing changes, is compared with `COMPANIONS` that start nearby, whatever the nudge of
+    members: three rollouts cost about three times as much. Of several members each is compared with each.
     """
     if members is None:
         streams = [stream_rollout(emulator, state, frames, monitor, prescribed)]
     else:
         streams = [stream_members(emulator, state, frames, members, seed, nudge, prescribed, monitor)]
     if members is None or members == 1:
-        streams.append(stream_members(emulator, state, frames, COMPANIONS, seed + 1, nudge, prescribed))
+        streams.append(stream_members(emulator, state, frames, COMPANIONS, seed + 1, prescribed=prescribed))
     for parts in zip(*streams, strict=True):
         tracker.see(torch.cat([part.position for part in parts]).unflatten(0, (-1, len(state.position))))
         if monitor is not None:
@@ -249,8 +249,8 @@ def _masked(part: Rollout, there: Tensor, kept: int) -> Rollout:
     return Rollout(position, fields)
 
 
-def calibrate(emulator: Emulator, windows: Iterable[Window], nudge: float | None = None) -> Trust:
-    """The trust of an emulator on recorded scenes, each the only one of a window, with companions of a nudge.
+def calibrate(emulator: Emulator, windows: Iterable[Window]) -> Trust:
+    """The trust of an emulator on recorded scenes, each the only one of a window.
 
     Raises:
         DataError: if there is none.
@@ -260,7 +260,7 @@ def calibrate(emulator: Emulator, windows: Iterable[Window], nudge: float | None
         state, frames = window.initial, window.target.shape[1]
         beside, apart = (TrustTracker(emulator.scene, state, Trust()) for _ in range(2))
         prescribed = Prescribed.of(window)
-        for part in stream_watched(emulator, state, frames, beside, nudge=nudge, prescribed=prescribed):
+        for part in stream_watched(emulator, state, frames, beside, prescribed=prescribed):
             recorded = window.target[:, apart.made : beside.made]
             apart.see(torch.stack([part.position, recorded.to(part.position)]))
         members.append(beside.curve[0])

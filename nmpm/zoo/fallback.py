@@ -55,12 +55,10 @@ def predict_trusted(
     return made._replace(position=made.position.unflatten(0, (members, -1)), fields=fields)
 
 
-def predict_and_simulate(
-    emulator: Emulator, trust: Trust, state: Particles, frames: int, preset: Preset, nudge: float | None = None
-) -> Rollout:
+def predict_and_simulate(emulator: Emulator, trust: Trust, state: Particles, frames: int, preset: Preset) -> Rollout:
     """Predict up to each scene's last trusted frame, `trusted` (B,), and simulate the rest by a preset."""
     preset = fitting_preset(emulator.scene, state, preset)
-    trusted = predict_trusted(emulator, trust, state, frames, nudge=nudge)
+    trusted = predict_trusted(emulator, trust, state, frames)
     return simulate_rest(emulator.scene, state, trusted, preset, frames)
 
 

@@ -82,23 +82,23 @@ class Predictor:
         """As `rollout`, with the particles' evolving fields beside their positions, and the last trusted frames."""
         if until not in (None, TRUSTED):
             raise ConfigError(f"until = {until!r}: a rollout ends after its frames (None) or until={TRUSTED!r}.")
+        if nudge is not None and members is None:
+            raise ConfigError(f"nudge = {nudge!r} displaces the starts of members: give members=8, too.")
+        if fallback is not None and (members is not None or prescribed is not None):
+            raise ConfigError(
+                "fallback: a simulator goes on from one rollout of what moves freely: leave members and what is"
+                " prescribed out."
+            )
         there, given = state.to(self.emulator.device), prescribed and prescribed.to(self.emulator.device)
         warn_of_start_outside(self.emulator, there)
         size = self.nudge if nudge is None else nudge
         if fallback is not None:
-            if members is not None or prescribed is not None:
-                raise ConfigError(
-                    "fallback: a simulator goes on from one rollout of what moves freely: leave members"
-                    " and what is prescribed out."
-                )
             preset = fallback if isinstance(fallback, Preset) else load_preset(fallback)
-            return predict_and_simulate(self.emulator, self.trust, there, frames, preset, size)
+            return predict_and_simulate(self.emulator, self.trust, there, frames, preset)
         if until is not None:
             return predict_trusted(self.emulator, self.trust, there, frames, given, members, seed, size)
         if members is not None:
             return predict_members(self.emulator, there, frames, members, seed, size, given)
-        if nudge is not None:
-            raise ConfigError(f"nudge = {nudge!r} displaces the starts of members: give members=8, too.")
         return predict_rollout(self.emulator, there, frames, prescribed=given)
 
     def differentiable_rollout(self, state: Particles, frames: int) -> Tensor:
