@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
         default=[],
         metavar="WHAT",
         help="for the cards: speed (on this machine), quality (earth mover's distance, energy, shape, worst scene),"
-        " ensemble (scores of eight members), twin and floor (the simulator beside itself), trust (by validation scenes),"
+        " ensemble (scores of eight members), twin and floor (the simulator beside itself), trust (by valid scenes),"
         " stress; invariants: the stress tests without the simulator, where its scenes would take hours",
     )
     refresh.add_argument("--data", type=Path, metavar="FOLDER", help="NAME's data; spares simulating its scenes")
