@@ -20,7 +20,7 @@ from nmpm._support.progress import progress_bar
 from nmpm.cli.recorded_start import compared, recorded_errors
 from nmpm.cli.rollout import kept_frames, trajectory_of
 from nmpm.data.described import described_metadata
-from nmpm.data.format import Trajectory
+from nmpm.data.format import MEMBER, Trajectory
 from nmpm.data.write import find_writer, write_trajectories
 from nmpm.emulator import Prescribed, Rollout
 from nmpm.emulator.input_checks import warn_of_start_outside
@@ -102,7 +102,7 @@ class MemberRollouts:
             start = self.written.with_motion(starts.position[[member]], self.written.velocity)
             rollout = frames.member(member)
             made = trajectory_of(self.model, self.scene, start, rollout, self.window, self.options)
-            return replace(made, attributes=made.attributes | {"member": member})
+            return replace(made, attributes=made.attributes | {MEMBER: member})
 
         first = trajectory(0)
         metadata = described_metadata(first.attributes, out, len(first.position))

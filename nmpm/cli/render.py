@@ -21,13 +21,19 @@ def run(words: list[str]) -> None:
     """Run the command, e.g. ["render", "out.h5"]."""
     parser = argparse.ArgumentParser(
         prog="nmpm render",
-        description="Draw a trajectory: snapshots as PNG, animation as GIF or MP4.",
+        description="Draw a trajectory: snapshots as PNG, animation as GIF or MP4. Of a rollout with --members it"
+        " draws one over the share of members that are at each place, and bands of height, front and energy.",
         epilog=_EXAMPLES,
         formatter_class=HelpFormatter,
     )
     parser.add_argument("file", type=Path, help="a rollout, or data of any format that nmpm inspect reads")
     add_split_option(parser, "FILE")
-    parser.add_argument("--trajectory", type=int, default=0, help="index of the trajectory (default: 0, the first)")
+    parser.add_argument(
+        "--trajectory",
+        type=int,
+        default=0,
+        help="index of the trajectory (default: 0, the first); of several members, the one that is drawn in full",
+    )
     parser.add_argument("--family", help="meaning of type ids if metadata.json lacks it: deepmind, lagrangebench")
     parser.add_argument("--mp4", action="store_true", help="write an MP4 instead of a GIF (pip install nmpm[video])")
     parser.add_argument("--out", type=Path, help="path of the pictures without suffix (default: that of the file)")

@@ -23,13 +23,19 @@ def run(words: list[str]) -> None:
     """Run the command, e.g. ["view", "out.h5", "truth.h5"]."""
     parser = argparse.ArgumentParser(
         prog="nmpm view",
-        description="Write a self-contained HTML page that plays a trajectory, or two beside each other.",
+        description="Write a self-contained HTML page that plays a trajectory, or two beside each other. Of a rollout"
+        " with --members it shows all members: faint, as density, or one by one, and bands of height, front, energy.",
         epilog=_EXAMPLES,
         formatter_class=HelpFormatter,
     )
     parser.add_argument("file", type=Path, help="a rollout, or data of any format that nmpm inspect reads")
     parser.add_argument("truth", type=Path, nargs="?", help="what FILE should be; errors are against it")
-    parser.add_argument("--trajectory", type=int, default=0, help="index in FILE (default: 0, the first)")
+    parser.add_argument(
+        "--trajectory",
+        type=int,
+        default=0,
+        help="index in FILE (default: 0, the first); of several members, the one that is drawn in full",
+    )
     add_split_option(parser, "FILE")
     parser.add_argument("--truth-trajectory", type=int, help="index in TRUTH (default: that of --trajectory)")
     parser.add_argument("--every", type=int, default=1, help="show every so many frames (default: 1, all)")

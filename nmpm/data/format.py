@@ -37,6 +37,8 @@ from nmpm.errors import DataError
 
 TRUTH = "truth"
 """Dataset of a prediction's group: the recorded positions (T', N, D) beside those that were predicted."""
+MEMBER = "member"
+"""Attribute of a trajectory that is a member of an ensemble: its number, from 0; neighbours count up."""
 VTKHDF = "VTKHDF"
 """Group by which ParaView reads a file, see `nmpm.data.write.vtkhdf`; it is not a trajectory."""
 TRACK = "track"

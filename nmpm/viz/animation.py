@@ -24,6 +24,7 @@ from nmpm._support.progress import progress_bar
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import fit_camera
 from nmpm.viz.charts import ChartStrip
+from nmpm.viz.occupancy import band_colours, ensemble_colour
 from nmpm.viz.output import check_output, replace_picture
 from nmpm.viz.panel import PanelRenderer, format_time
 from nmpm.viz.trajectories import LabelledTrajectories
@@ -109,6 +110,13 @@ class FrameRenderer:
             image.paste(self._strip.draw(frame), (0, self._strip_top))
         draw.text((MARGIN, self._footer_baseline), self._time_text(frame), TEXT, self._font, anchor="ls")
         return np.asarray(image)
+
+    @property
+    def colours(self) -> list[Rgb]:
+        """Those of materials and obstacles, and of an ensemble's bands."""
+        materials = self.trajectories.materials
+        bands = [ensemble_colour(materials), *band_colours(materials)] if self._members else []
+        return [*material_colours(materials).values(), OBSTACLE, *bands]
 
     def _draw_template(self) -> Image.Image:
         """The parts that are the same in every frame: title, labels and legend."""
@@ -226,7 +234,7 @@ def _draw_frames(renderer: FrameRenderer, frames: list[int]) -> Iterator[NDArray
 def _write_gif(renderer: FrameRenderer, frames: list[int], fps: float, path: Path) -> None:
     indices = np.linspace(0, len(frames) - 1, PALETTE_SAMPLES).astype(int)
     samples = [renderer.draw(frames[index]) for index in dict.fromkeys(indices.tolist())]
-    palette = GifPalette(samples, [*material_colours(renderer.trajectories.materials).values(), OBSTACLE])
+    palette = GifPalette(samples, renderer.colours)
     first, *rest = (palette.quantize(frame) for frame in _draw_frames(renderer, frames))
     frame_time = round(100 / fps) * 10
     durations = [frame_time] * len(rest) + [max(frame_time, round(LAST_FRAME_SECONDS * 1000))]

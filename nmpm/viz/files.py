@@ -9,15 +9,13 @@ import numpy as np
 from nmpm.data.convert import Options
 from nmpm.data.described import read_description
 from nmpm.data.fields import read_fields
-from nmpm.data.format import TRUTH, Metadata, Split, Trajectory, read_metadata
+from nmpm.data.format import MEMBER, TRUTH, Metadata, Split, Trajectory, read_metadata
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 from nmpm.viz.trajectories import Floats, LabelledTrajectories, material_names
 
-MEMBER = "member"
-"""Attribute of a trajectory of an ensemble: its number, counted from 0."""
 TOLERANCE = 1e-3
 """Share of the box by which first frames may differ where one file is the prediction of the other."""
 MEMBER_TOLERANCE = 3e-2

@@ -7,12 +7,14 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm._support.colours import INTERIOR, OBSTACLE, Rgb, material_colours
+from nmpm._support.colours import INTERIOR, Rgb, material_colours
 
 LEVELS = (0.1, 0.5, 0.9)
 """Shares of members at which the bands of a picture begin."""
 TINTS = (0.18, 0.35, 0.55)
 """Share of the ensemble's colour in these bands, light to dark."""
+SEVERAL: Rgb = (84, 98, 122)
+"""The colour of bands where there are several materials."""
 CELL = 0.7
 """Side of a cell in particle spacings."""
 
@@ -53,8 +55,8 @@ def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def ensemble_colour(materials: tuple[str, ...]) -> Rgb:
-    """The colour of an ensemble's bands: that of its material, or grey where there are several."""
-    return material_colours(materials)[materials[0]] if len(materials) == 1 else OBSTACLE
+    """The colour of an ensemble's bands: that of its material where it has one alone."""
+    return material_colours(materials)[materials[0]] if len(materials) == 1 else SEVERAL
 
 
 def band_colours(materials: tuple[str, ...]) -> list[Rgb]:
