@@ -39,6 +39,6 @@ def run(words: list[str]) -> None:
         "--data", required=True, metavar="DATASET", help="an embedded dataset (goop, …), or a file or folder of data"
     )
     add_scene_options(parser, "compare", scenes=6)
-    parser.set_defaults(config=None, predictors=[])
+    parser.set_defaults(config=None, predictors=[], members=None)
     options = parser.parse_args(words[1:])
     measure_and_report("compare", options, options.data)

@@ -35,6 +35,7 @@ examples:
   nmpm trade goop                               the zoo's models of goop beside its simulator
   nmpm trade goop --models goop runs/a runs/b   models of your own beside it
   nmpm trade goop --predictors mine:make        a predictor of another package: make(scene) gives it
+  nmpm trade waterramps --members 8             ensembles of the models, judged by their fair CRPS
   nmpm trade FOLDER --models runs/mine          recorded data of any form: without a simulator
   nmpm trade --print_config > sweep.yaml        what is measured; edit it, then:
   nmpm trade goop --config sweep.yaml
@@ -74,6 +75,9 @@ def _parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     parser.add_argument("--config", type=Path, metavar="FILE", help="YAML of what is measured, see --print_config")
     parser.add_argument("--print_config", action="store_true", help="print the shipped sweep, and stop")
+    parser.add_argument(
+        "--members", type=int, metavar="M", help="also an ensemble of M rollouts of each model, and everybody's CRPS"
+    )
     add_scene_options(parser, "trade", scenes=20)
     return parser
 
@@ -95,6 +99,7 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
     match, facts = MatchOptions.read(options.materials, options.stride, options.strict), data_options(options)
     check_at_least("--scenes", options.scenes, 1)
     check_at_least("--wider", options.wider, 2)
+    check_at_least("--members", options.members, 1)
     if options.wider and (stated := stated_facts(options)):
         raise ConfigError(f"{stated[0]}: --wider simulates scenes, and their facts are known: leave it out.")
     check_device(options.device)
@@ -113,6 +118,7 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
     else:
         sweep = trade.read_sweep(read_text(options.config), str(options.config))
     sweep = sweep if options.scenes is None else sweep.with_scenes(options.scenes)
+    sweep = sweep if options.members is None else sweep.with_members(options.members)
     predictors = [trade.find_factory(path) for path in options.predictors]
     models = _models_of(Path(dataset).name) if options.models is None else _load_models(options.models)
     if options.wider:

@@ -8,6 +8,7 @@
 | kinetic | mean absolute error of the kinetic energy, over its mean |
 | height | deviation of the mean height above the floor in the last frame, relative |
 | crowding | deviation of the particles per occupied cell in the last frame, relative |
+| crps | fair CRPS of the density in cells, of one rollout its absolute error; mean over evenly spaced frames |
 
 Position errors barely notice a liquid that slowly loses its volume; height and crowding do.
 """
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nmpm.metrics import earth_mover_of_materials
+from nmpm.metrics.ensembles import fair_crps, measure_quantities
 from nmpm.metrics.quantities import counting_grid, energies, into_domain, measure_shape, volume_fractions
 from nmpm.particles import Window
 from nmpm.scene import Scene
@@ -43,25 +45,31 @@ class Measures:
         horizons: Frames up to which the MSE is reported, beside the full rollout.
         emd_frames: Evenly spaced frames at which the earth mover's distance is computed; 0 for none.
         emd_particles: Particles of a material, drawn at random, that it matches; all when left out.
+        crps: Whether the fair CRPS of densities is measured, in which ensembles compete.
     """
 
     horizons: tuple[int, ...] = (8, 32, 100)
     emd_frames: int = 1
     emd_particles: int | None = None
+    crps: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as plain data."""
-        return dataclasses.asdict(self) | {"horizons": list(self.horizons), "revision": REVISION}
+        plain = dataclasses.asdict(self) | {"horizons": list(self.horizons), "revision": REVISION}
+        return plain if self.crps else {name: value for name, value in plain.items() if name != "crps"}
 
 
 def measure_errors(scene: Scene, window: Window, predicted: Tensor, measures: Measures) -> dict[str, float]:
     """Errors of a prediction (1, T, N, D) of the only scene of a window; all positions that count are finite.
 
+    Of several members (M, T, N, D) `crps` is that of all, the others are those of the first.
     Where the data have only some of the model's frames, these count, and horizons are in frames of the data.
     Of particles that enter and leave, those that are present count, and energies and shapes are left out.
     """
     if window.observed is not None:
         window, predicted = window.at_observed(), predicted[:, window.observed_targets]
+    crps = {"crps": density_crps(scene, window, predicted)} if measures.crps else {}
+    predicted = predicted[:1]
     moving = window.mask[0]
     material = window.material[0, moving]
     volume = None if window.volume is None else window.volume[0, moving].double()
@@ -69,6 +77,7 @@ def measure_errors(scene: Scene, window: Window, predicted: Tensor, measures: Me
     ours, theirs = predicted[0, :, moving].double(), window.target[0, :, moving].double()
     curve = squared_errors(window, predicted)
     errors = {"mse": _mean(curve)} | {f"mse@{h}": _mean(curve[:h]) for h in measures.horizons if h <= len(curve)}
+    errors |= crps
     errors["field"] = field_error(scene, ours, theirs, material, there, volume)
     if measures.emd_frames:
         frames = _evenly_spaced(len(ours), measures.emd_frames)
@@ -135,6 +144,26 @@ def field_error(
     )
     wrong, total = (each.flatten(1).sum(1) for each in ((first - second).abs(), first + second))
     return _mean(wrong / total)
+
+
+def density_crps(scene: Scene, window: Window, members: Tensor) -> float:
+    """Mean over cells, materials and evenly spaced frames of the fair CRPS of the density.
+
+    Args:
+        scene: Gives domain, materials and particle spacing.
+        window: Of one scene; of its particles those count that are present.
+        members: (M, T, N, D) positions.
+    """
+    scores = []
+    for frame in _evenly_spaced(members.shape[1], _FIELD_FRAMES).tolist():
+        recorded, predicted = window.recorded[:, frame + 2], members[:, frame]
+        if window.present is not None:
+            predicted = predicted.where(window.present[:, frame + 2].unsqueeze(-1), torch.nan)
+        truth, ensemble = (
+            measure_quantities(scene, window, position, position)["density"] for position in (recorded, predicted)
+        )
+        scores.append(float(fair_crps(ensemble, truth[0]).mean()))
+    return float(np.mean(scores))
 
 
 def _mean(values: Tensor) -> float:

@@ -1,3 +1,5 @@
+import json
+
 from nmpm.cli import main
 from nmpm.cli.trade import _models_of
 from nmpm.evaluation.trade import shipped_sweep_text
@@ -53,3 +55,19 @@ def test_models_are_compared(tmp_path, capsys, monkeypatch):
         assert name in out
     written = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"points", "compare.csv", "compare.json", "errors.png", "frames.png"} < written
+
+
+def test_ensembles_stand_beside_one_rollout_in_time_and_crps(tmp_path, capsys, monkeypatch):
+    scenes = tiny_scenes(tmp_path / "tiny")
+    model = type("Loaded", (), {"emulator": tiny_emulator(scenes.scene)})
+    monkeypatch.setattr("nmpm.zoo.load_model", lambda _: model)
+    (tmp_path / "sweep.yaml").write_text(SWEEP)
+    words = ["trade", str(tmp_path / "tiny"), "--models", "carried", "--config", str(tmp_path / "sweep.yaml")]
+    assert main([*words, "--members", "3", "--out", str(tmp_path / "out")]) == 0
+    assert "CRPS ×10⁻³: fair" in " ".join(capsys.readouterr().out.split())
+    choices = {one["name"]: one for one in json.loads((tmp_path / "out" / "trade.json").read_text())["predictors"]}
+    ensemble, single = choices["carried, 3 members"], choices["carried"]
+    assert 0 < ensemble["errors"]["crps"]["mean"] != single["errors"]["crps"]["mean"] > 0
+    assert ensemble["ms_per_frame"]["median"] > single["ms_per_frame"]["median"]
+    assert main([*words, "--members", "0"]) == 1
+    assert "--members" in capsys.readouterr().err

@@ -144,12 +144,11 @@ def _figure(value: float) -> float | None:
 
 
 def likely_points(points: Sequence[Point]) -> list[Point]:
-    """The points in the Pareto set of time and MSE, or likely to be, and the floors."""
-    ranks = rank(points)
+    """The points in the Pareto set of time and MSE, or of time and CRPS, or likely to be, and the floors."""
+    by_error = [rank(points, measure) for measure in ("mse", "crps") if measure in {"mse", *measure_names(points)}]
+    likely = {name for ranks in by_error for name, one in ranks.items() if one.probability >= _LIKELY}
     return [
-        point
-        for point in points
-        if point.name in ranks and (point.kind is Kind.FLOOR or ranks[point.name].probability >= _LIKELY)
+        point for point in points if point.name in likely or (point.kind is Kind.FLOOR and point.name in by_error[0])
     ]
 
 
@@ -185,7 +184,7 @@ def _summary(
     particles = f"{counts[0]}" if counts[0] == counts[-1] else f"{counts[0]} to {counts[-1]}"
     frames = max(scenes.frames(index) for index in range(len(scenes)))
     horizons = [name for name in measure_names(points) if name.startswith("mse@") and name != f"mse@{frames}"]
-    ranks = rank(points)
+    ranks, crps = rank(points), "crps" in measure_names(points)
     unit = Unit.of([point.mean(name) for point in shown for name in (*horizons, "mse", "emd")])
 
     def show(value: float, digits: int = 3) -> str:
@@ -202,6 +201,7 @@ def _summary(
                 f"{point.milliseconds:.3g}" if math.isfinite(point.milliseconds) else "",
                 *(show(point.mean(name), 2) for name in horizons),
                 show(point.mean("mse")) + spread,
+                *([f"{1e3 * point.mean('crps'):.3g}"] if crps else []),
                 show(point.mean("emd")),
                 f"{height:.0%}" if math.isfinite(height) else "",
             ]
@@ -209,8 +209,14 @@ def _summary(
     return (
         f"{scenes.name}: {len(scenes)} test scenes of {particles} particles",
         f"MSE{unit} of frames 1 to h. EMD{unit}: earth mover's distance in the last frame. Height: deviation of the"
-        " particles' mean height in the last frame. ms: per frame, median. *: perhaps in the Pareto set.",
-        ["choice", "ms", *(name.replace("mse", "MSE") for name in horizons), f"MSE@{frames} (95%)", "EMD", "height"],
+        " particles' mean height in the last frame. ms: per frame, median. *: perhaps in the Pareto set."
+        + " CRPS ×10⁻³: fair, of densities; of members ms is of all, MSE of the first."
+        * crps,
+        [
+            *("choice", "ms", *(name.replace("mse", "MSE") for name in horizons), f"MSE@{frames} (95%)"),
+            *(["CRPS"] if crps else []),
+            *("EMD", "height"),
+        ],
         rows,
     )
 

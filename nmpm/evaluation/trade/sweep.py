@@ -32,6 +32,7 @@ from nmpm.evaluation.trade.choices import (
     digest,
 )
 from nmpm.evaluation.trade.fitted import FittedModel, fit_to_scenes
+from nmpm.evaluation.trade.members import MembersChoice
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.scene import Scene
 from nmpm.sim import Preset
@@ -63,12 +64,14 @@ class ModelSettings:
         constraints: "held", with the model's constraints, and "free", without them.
         runtime: What computes the network, see `nmpm.emulator.runtimes.RUNTIMES`.
         batch: Batch sizes, in scenes.
+        members: Rollouts of each scene by a model's first form, which stand beside it as an ensemble; 0 for none.
     """
 
     precision: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
     constraints: tuple[Literal["held", "free"], ...] = ("held", "free")
     runtime: tuple[str, ...] = ("eager",)
     batch: tuple[int, ...] = (1, 8)
+    members: int = 0
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,8 @@ class Sweep:
         for key, values in positive.items():
             if min(values, default=1) <= 0:
                 raise ConfigError(f"{key}: {min(values)!r} must be a positive number.")
+        if self.models.members < 0:
+            raise ConfigError(f"models.members: {self.models.members!r} must be 0 or more.")
         if max(self.models.batch, default=1) > self.scenes:
             raise ConfigError(f"models.batch: {max(self.models.batch)} scenes at once of {self.scenes} scenes in all.")
 
@@ -122,6 +127,14 @@ class Sweep:
         """The sweep of another number of test scenes, without batches of more."""
         batch = tuple(batch for batch in self.models.batch if batch <= count) or (1,)
         return dataclasses.replace(self, scenes=count, models=dataclasses.replace(self.models, batch=batch))
+
+    def with_members(self, count: int) -> Sweep:
+        """The sweep with ensembles of so many members, and the fair CRPS of all choices."""
+        models, measures = (
+            dataclasses.replace(self.models, members=count),
+            dataclasses.replace(self.measures, crps=True),
+        )
+        return dataclasses.replace(self, models=models, measures=measures)
 
 
 def shipped_sweep_text(name: str) -> str:
@@ -252,4 +265,26 @@ def _model_choices(settings: ModelSettings, model: FittedModel, scenes: Scenes, 
                 device=device,
             )
             forms.setdefault(digest([dict(choice.identity), batch]), choice)
-    return list(forms.values())
+    return [*forms.values(), *_ensembles(settings, model, device, facts)]
+
+
+def _ensembles(
+    settings: ModelSettings, model: FittedModel, device: torch.device, facts: Mapping[str, Any]
+) -> Iterator[Choice]:
+    """The members of a model's first form; ConfigError for a model that is matched to the scenes."""
+    if not settings.members:
+        return
+    if model.reading is not None:
+        raise ConfigError(
+            f"--members: {model.name} was trained on scenes of another kind, and only its one rollout is matched to"
+            " these: leave --members or this model out."
+        )
+    form = model.emulator.with_network(NETWORK_PRECISIONS[settings.precision[0]])
+    form = form if settings.constraints[0] == "held" else form.unconstrained()
+    yield MembersChoice(
+        name=f"{facts['model']}, {counted(settings.members, 'member')}",
+        emulator=form.to(device).with_runtime(settings.runtime[0]),
+        members=settings.members,
+        settings=facts,
+        device=device,
+    )

@@ -1,0 +1,42 @@
+"""Ensembles of an emulator's rollouts as a choice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from nmpm.emulator import Prescribed, stream_members
+from nmpm.emulator.members import nudge_of
+from nmpm.evaluation.trade.choices import ModelChoice, Rollout
+from nmpm.evaluation.trade.scenes import Scenes
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MembersChoice(ModelChoice):
+    """Several rollouts of each scene, see `nmpm.emulator.members`; a scene's time is that of all of them.
+
+    Args:
+        members: M. Errors of positions are those of the first, `crps` is that of all.
+    """
+
+    members: int
+
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        return {**super().identity, "members": self.members, "nudge": nudge_of(self.emulator, None)}
+
+    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
+        (index,) = indices
+        window = scenes.window(indices)
+        state, prescribed = window.initial.to(self.device), Prescribed.of(window)
+        given = prescribed and prescribed.to(self.device)
+        return lambda frames: torch.cat(
+            [
+                part.position
+                for part in stream_members(self.emulator, state, frames, self.members, index, prescribed=given)
+            ],
+            dim=1,
+        )
