@@ -55,7 +55,7 @@ examples:
   nmpm rollout goop --device cuda                        on a GPU, by CUDA graphs
   nmpm rollout waterramps --until trusted                as far as it predicts this scene
   nmpm rollout waterramps --fallback waterramps          and on from there by the simulator
-  nmpm rollout waterramps --members 8                    eight futures from one start, a trajectory each
+  nmpm rollout waterramps --members 8                    eight futures of one start
 """
 
 
