@@ -38,8 +38,9 @@ from nmpm.emulator import Prescribed, stream_members, stream_rollout
 from nmpm.emulator.prescribed import with_predicted
 from nmpm.errors import UnstableError
 from nmpm.evaluation.bootstrap import resampled_means
+from nmpm.grid import counting_grid
 from nmpm.metrics.ensembles import EnsembleScores, mean_scores
-from nmpm.metrics.quantities import counting_grid, into_domain, measure_shape
+from nmpm.metrics.quantities import into_domain, measure_shape
 from nmpm.particles import Window
 from nmpm.scene import Reading, Scene
 from nmpm.sim import preset_from_dict
@@ -266,7 +267,7 @@ def draw_ranks(results: Sequence[Result], frames: Sequence[int], path: Path) -> 
     for row, result in zip(axes, results, strict=True):
         for axis, name in zip(row, names, strict=True):
             if (ranks := result.ranks.get(name)) is not None:
-                axis.bar(range(len(ranks)), ranks / ranks.sum(), width=0.9)
+                axis.bar(range(len(ranks)), (ranks / ranks.sum()).tolist(), width=0.9)
                 axis.axhline(1 / len(ranks), color="black", linewidth=0.8)
             axis.set_title(f"{result.label}\n{name.replace('@', ', frame ')}", fontsize=7)
             axis.tick_params(labelsize=6)

@@ -20,6 +20,7 @@ from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
 
 _MAX_ROUNDING = 1 / 16  # of a cell: coarser positions are useless
+_COUNTING_CELL = 3.0  # particle spacings
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,12 @@ class Grid:
         """Cell centres along an axis, (n,), in domain length, on the CPU."""
         index = torch.arange(self.shape[axis], dtype=dtype, device="cpu")
         return self.lower[axis] + (index + 0.5) * self.spacing[axis]
+
+
+def counting_grid(scene: Scene) -> Grid:
+    """The grid of cells of 3 particle spacings, in which measures count particles."""
+    longest = max(high - low for low, high in scene.domain)
+    return Grid.of(scene, max(1, round(longest / (_COUNTING_CELL * scene.particle_spacing))))
 
 
 def per_axis(operation: Callable[[Tensor, float], Tensor], values: Tensor, numbers: Sequence[float]) -> Tensor:

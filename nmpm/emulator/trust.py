@@ -26,7 +26,7 @@ from nmpm.emulator.monitor import Monitor
 from nmpm.emulator.prescribed import Prescribed
 from nmpm.emulator.rollouts import Rollout, stream_rollout
 from nmpm.errors import DataError
-from nmpm.grid import Grid
+from nmpm.grid import counting_grid
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.transfer import Linear
@@ -35,7 +35,6 @@ COMPANIONS = 2
 """Nudged rollouts with which a single one is compared."""
 ERROR = 0.1
 """Disagreement with the recorded scene that ends trust."""
-_CELL = 3.0  # particle spacings: side of the cells in which material is counted
 _REGION = 4  # cells along each side of a region
 _LIMITS = torch.logspace(-2, 0, 140).tolist()
 _WITHIN = 0.68  # share of the validation scenes within the stated error
@@ -123,7 +122,7 @@ class TrustTracker:
 
     def __init__(self, scene: Scene, state: Particles, trust: Trust) -> None:
         self.trust, self.made = trust, 0
-        self._scene, self._grid = scene, _counting_grid(scene)
+        self._scene, self._grid = scene, counting_grid(scene)
         self._values = functional.one_hot(state.material, len(scene.materials)) * state.present_volume.unsqueeze(-1)
         self._values = self._values.to(torch.float32)
         scenes = len(state.position)
@@ -190,11 +189,6 @@ def _sum_blocks(values: Tensor, dim: int) -> Tensor:
         padding = [0, 0] * (-axis - 1) + [0, -values.shape[axis] % _REGION]
         values = functional.pad(values, padding).unflatten(axis, (-1, _REGION)).sum(axis)
     return values
-
-
-def _counting_grid(scene: Scene) -> Grid:
-    longest = max(high - low for low, high in scene.domain)
-    return Grid.of(scene, max(1, round(longest / (_CELL * scene.particle_spacing))))
 
 
 def stream_watched(

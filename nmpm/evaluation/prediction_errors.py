@@ -24,9 +24,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nmpm.grid import counting_grid
 from nmpm.metrics import earth_mover_of_materials
 from nmpm.metrics.ensembles import fair_crps, measure_quantities
-from nmpm.metrics.quantities import counting_grid, energies, into_domain, measure_shape, volume_fractions
+from nmpm.metrics.quantities import energies, into_domain, measure_shape, volume_fractions
 from nmpm.particles import Window
 from nmpm.scene import Scene
 

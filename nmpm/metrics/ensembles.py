@@ -24,7 +24,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nmpm.metrics.quantities import counting_grid, energies, front, into_domain, mean_height, volume_fractions
+from nmpm.grid import counting_grid
+from nmpm.metrics.quantities import energies, front, into_domain, mean_height, volume_fractions
 from nmpm.particles import Window
 from nmpm.scene import Scene
 
@@ -161,6 +162,9 @@ class EnsembleScores:
             window: Of this scene alone, with T + 2 frames.
             members: Consecutive parts (M, t, N, D) of the T predicted frames, as `stream` yields them of M copies of
                 the start; only frames that are scored are kept.
+
+        Raises:
+            ValueError: if they are fewer frames than the window has to predict, or not as many as of other scenes.
         """
         observed, window = window.observed_targets, window.at_observed()
         last = len(observed)
@@ -189,6 +193,8 @@ class EnsembleScores:
         if len(members) > 1 and bool(differ.any()):
             members, truth = members[:, differ], truth[differ]
             ranks = truth_ranks(members, truth, self._generator).bincount(minlength=len(members) + 1)
+            if len(ranks) != len(self.ranks.get(name, ranks)):
+                raise ValueError(f"{len(members)} members after scenes of {len(self.ranks[name]) - 1}: give as many.")
             self.ranks[name] = self.ranks.get(name, 0) + ranks
             for level in LEVELS:
                 scores[f"coverage{level}_{name}"] = interval_coverage(members, truth, level).mean()
@@ -234,6 +240,8 @@ def _consume(
                 kept[numbers[model]] = at.clone()
         targets = [numbers[model] - 1 for model in models]
         squared[targets] = _squared_errors(window, targets, position)
+    if frame <= observed[-1]:
+        raise ValueError(f"Members have {frame} frames, of {observed[-1] + 1} to predict.")
     kept[0] = kept[0].expand(len(position), -1, -1)
     return squared, kept
 

@@ -10,7 +10,6 @@ from nmpm.particles import Particles
 from nmpm.scene import Scene
 from nmpm.transfer import Linear, Nearest
 
-_CELL = 3.0  # particle spacings: side of the cells in which particles are counted
 _FRONT = 0.95  # of the volume is behind the front
 _MOST_CROWDED = 0.05  # of the occupied cells: those whose crowding is averaged
 
@@ -21,12 +20,6 @@ def into_domain(scene: Scene, position: Tensor) -> Tensor:
     for along, (low, high), periodic in zip(position.unbind(-1), scene.domain, scene.periodic, strict=True):
         columns.append(low + (along - low).remainder(high - low) if periodic else along.clamp(low, high))
     return torch.stack(columns, dim=-1)
-
-
-def counting_grid(scene: Scene) -> Grid:
-    """The grid of cells of 3 particle spacings, in which particles are counted."""
-    longest = max(high - low for low, high in scene.domain)
-    return Grid.of(scene, max(1, round(longest / (_CELL * scene.particle_spacing))))
 
 
 def volume_fractions(scene: Scene, grid: Grid, position: Tensor, material: Tensor, volume: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+from nmpm.grid import counting_grid
 from nmpm.metrics.ensembles import (
     EnsembleScores,
     fair_crps,
@@ -14,7 +15,7 @@ from nmpm.metrics.ensembles import (
     spread_and_skill,
     truth_ranks,
 )
-from nmpm.metrics.quantities import counting_grid, front, volume_fractions
+from nmpm.metrics.quantities import front, volume_fractions
 from nmpm.particles import Window
 from tests.scenes import CHANNEL, box, cloud
 
@@ -129,3 +130,13 @@ def test_of_particles_that_come_and_go_the_density_of_those_that_are_there_is_sc
     scores.update(window, [members])
     assert {name.partition("_")[2] for name in scores.compute() if name.startswith("crps")} == {"density@4", "density"}
     assert all(math.isfinite(value) for value in scores.compute().values())
+
+
+def test_members_that_do_not_fit_are_refused():
+    window, members = window_and_members(3)
+    scores = EnsembleScores(box(), (4,))
+    with pytest.raises(ValueError, match="11 frames, of 12 to predict"):
+        scores.update(window, [members[:, :11]])
+    scores.update(window, [members])
+    with pytest.raises(ValueError, match="2 members after scenes of 3"):
+        scores.update(window, [members[:2]])
