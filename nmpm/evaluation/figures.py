@@ -8,6 +8,7 @@ from statistics import median
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 PREDICTORS: Mapping[str, str] = MappingProxyType(
@@ -89,20 +90,19 @@ def no_better_than_trivial(figures: Mapping[str, float]) -> str:
     )
 
 
-ENSEMBLE_COLUMNS = ("one rollout", "members", "spread over skill", "within 50%", "within 90%")
+ENSEMBLE_COLUMNS = ("single", "members", "spread/skill", "in 50%", "in 90%")
 """Of the table of an ensemble's scores: two of the fair CRPS, spread over skill, coverage of central intervals."""
 
 
 def ensemble_rows(ensemble: Mapping[str, Any]) -> list[tuple[str, list[str]]]:
-    """A label and cells below `ENSEMBLE_COLUMNS` for each quantity and frame of `EnsembleTest.to_dict`."""
+    """Name and cells below `ENSEMBLE_COLUMNS` of each quantity and frame, of `EnsembleTest.to_dict`."""
     rows = []
     for name, scores in ensemble["scores"].items():
-        quantity, _, frame = name.partition("@")
         low, high = (1e3 * value for value in scores["interval"])
         further = [scores.get(key) for key in ("spread_skill", "coverage50", "coverage90")]
-        cells = [f"{1e3 * scores['single']:.3g}", f"{1e3 * scores['crps']:.3g} ({low:.3g} – {high:.3g})"]
+        cells = [f"{1e3 * scores['single']:.3g}", f"{1e3 * scores['crps']:.3g} ({low:.3g}–{high:.3g})"]
         cells += ["" if value is None else f"{value:.2f}" for value in further]
-        rows.append((f"{quantity}, {f'frame {frame}' if frame else 'last frame'}", cells))
+        rows.append((name, cells))
     return rows
 
 
@@ -114,10 +114,10 @@ def ensemble_title(ensemble: Mapping[str, Any]) -> str:
 
 def ensemble_table(what: str, ensemble: Mapping[str, Any]) -> Table:
     """The scores of an ensemble beside those of one rollout."""
-    table = Table(title=f"{what} {ensemble_title(ensemble)}")
+    table = Table(title=f"{what} {ensemble_title(ensemble)}", box=SIMPLE_HEAD)
     table.add_column("quantity")
     for name in ENSEMBLE_COLUMNS:
-        table.add_column(name, justify="right")
-    for label, cells in ensemble_rows(ensemble):
-        table.add_row(label, *cells)
+        table.add_column(name, justify="right", no_wrap=True)
+    for name, cells in ensemble_rows(ensemble):
+        table.add_row(name, *cells)
     return table

@@ -55,7 +55,7 @@ def test_an_entry_of_a_model_that_reads_noise_states_what_its_members_say(run, s
     (run / "report.json").write_text(json.dumps(report | {"ensemble": ensemble}))
     text = (add(run, "mine") / "README.md").read_text()
     assert "Fair CRPS ×10⁻³ of 8 members, in units of each quantity" in text
-    assert "| density, frame 100 | 40 | 12.3 (10 – 20) | 0.90 | 0.50 | 0.80 |" in text
+    assert "| density, frame 100 | 40 | 12.3 (10–20) | 0.90 | 0.50 | 0.80 |" in text
     model = Zoo.load("mine")
     assert model.card["ensemble"] == ensemble
     assert model.nudge == 0
