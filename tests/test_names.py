@@ -3,6 +3,7 @@
 import ast
 import inspect
 import re
+import tomllib
 from collections.abc import Iterator
 from importlib import import_module
 
@@ -78,6 +79,21 @@ def wrong_names(text: str) -> Iterator[str]:
 
 def test_names_in_strings_exist():
     assert not [(file, name) for file, tree in TREES.items() for text in texts(tree) for name in wrong_names(text)]
+
+
+def test_extras_that_messages_name_exist():
+    """Where nmpm is installed, from a clone too, pip adds an extra to it without looking for nmpm on an index."""
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    commands = [
+        command
+        for tree in TREES.values()
+        for text in texts(tree)
+        for command in re.findall(r"pip install[^:;(]*", text)
+    ]
+    named = {extra for command in commands for extra in re.findall(r"\"nmpm\[(\w+)\]\"", command)}
+    assert named
+    assert named <= set(project["optional-dependencies"])
+    assert not [command for command in commands if re.search(r"(?<!\")nmpm", command)]  # none is on an index
 
 
 def test_wrong_names_are_noticed():

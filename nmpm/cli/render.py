@@ -35,7 +35,7 @@ def run(words: list[str]) -> None:
         help="index of the trajectory (default: 0, the first); of several members, the one that is drawn in full",
     )
     parser.add_argument("--family", help="meaning of type ids if metadata.json lacks it: deepmind, lagrangebench")
-    parser.add_argument("--mp4", action="store_true", help="write an MP4 instead of a GIF (pip install nmpm[video])")
+    parser.add_argument("--mp4", action="store_true", help='an MP4 in place of the GIF (pip install "nmpm[video]")')
     parser.add_argument("--out", type=Path, help="path of the pictures without suffix (default: that of the file)")
     arguments = parser.parse_args(words[1:])
     from nmpm.data.convert import Options, native_file

@@ -142,7 +142,7 @@ def check_format(version: object, what: str) -> None:
     Raises ConfigError if the format is newer, or not a number.
     """
     if not isinstance(version, int) or version > FORMAT:
-        raise ConfigError(f"{what} has format {version}; this nmpm reads up to {FORMAT}: pip install --upgrade nmpm.")
+        raise ConfigError(f"{what} has format {version}; this nmpm reads up to {FORMAT}: use a newer one.")
 
 
 def _plain(value: Any) -> Any:

@@ -27,7 +27,7 @@ def check_output(path: Path, suffixes: Sequence[str]) -> str:
             get_ffmpeg_exe()
         except (ImportError, RuntimeError) as error:
             raise ConfigError(
-                "MP4 needs a video encoder that is not installed: `pip install nmpm[video]`, or write a .gif instead."
+                'MP4 needs a video encoder that is not installed: pip install "nmpm[video]", or write a .gif instead.'
             ) from error
     if obstacle := file_obstacle(path):
         raise DataError(f"Cannot write {path}: {obstacle}")

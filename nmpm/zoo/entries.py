@@ -59,8 +59,8 @@ def read_card(folder: Path) -> dict[str, Any]:
         raise ZooError(str(error)) from error
     if card.get("format") != FORMAT:
         raise ZooError(
-            f"{folder / CARD} has format {one_line(card.get('format'), 60)}; this nmpm reads {FORMAT}: pip install"
-            " --upgrade nmpm."
+            f"{folder / CARD} has format {one_line(card.get('format'), 60)}; this nmpm reads {FORMAT}: use a"
+            " version that reads it."
         )
     return card
 

@@ -222,7 +222,7 @@ def test_render_writes_snapshots_and_an_animation(words, stem, suffix, capsys):
     ("words", "message"),
     [
         (["--out", "missing/a"], "the folder missing does not exist"),
-        (["--mp4"], "pip install nmpm[video]"),
+        (["--mp4"], 'pip install "nmpm[video]"'),
         (["--trajectory", "1"], "trajectories 0 … 0"),
     ],
 )

@@ -108,7 +108,7 @@ def test_damaged_entries_are_refused(root, file):
 def test_cards_of_other_formats_are_refused(root, other):
     path = root / "small" / "card.yaml"
     path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | {"format": other}))
-    with pytest.raises(ZooError, match=rf"card.yaml has format {other}; this nmpm reads 1: pip install"):
+    with pytest.raises(ZooError, match=rf"card.yaml has format {other}; this nmpm reads 1: use a"):
         Zoo.card("small", root)
 
 

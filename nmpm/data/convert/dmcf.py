@@ -34,7 +34,7 @@ class Dmcf(FileFormat):
     """A file per trajectory; particle type 0 is the fluid, type 1 the solid boundary."""
 
     name: ClassVar[str] = "dmcf"
-    summary: ClassVar[str] = "DMCF's *.msgpack.zst files (needs the extra: pip install nmpm[convert])"
+    summary: ClassVar[str] = 'DMCF\'s *.msgpack.zst files (needs: pip install "nmpm[convert]")'
     pattern: ClassVar[str] = "*.msgpack.zst"
     family: ClassVar[str] = "lagrangebench"
     assumed: ClassVar[frozenset[str]] = frozenset({"dt", "gravity"})
@@ -73,7 +73,7 @@ def _frames(path: Path) -> Iterator[dict[str, Any]]:
         import msgpack
         import zstandard
     except ImportError as error:
-        raise ConfigError(f"{path}: reading it needs more packages: pip install 'nmpm[convert]'.") from error
+        raise ConfigError(f'{path}: reading it needs more packages: pip install "nmpm[convert]".') from error
     check_regular(path)
     with (
         readable(path, "DMCF's frames", zstandard.ZstdError, msgpack.UnpackException, RecursionError),

@@ -24,7 +24,7 @@ class Ply(FrameFormat):
     """The element `vertex` of PLY files; a comment such as `time 0.5` states the time."""
 
     name: ClassVar[str] = "ply"
-    summary: ClassVar[str] = "PLY files of points, a file per frame (needs: pip install nmpm[vtk])"
+    summary: ClassVar[str] = 'PLY files of points, a file per frame (needs: pip install "nmpm[vtk]")'
     patterns: ClassVar[tuple[str, ...]] = ("*.ply",)
 
     def frames(self, file: Path) -> Iterator[Frame]:

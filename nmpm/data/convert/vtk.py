@@ -27,7 +27,7 @@ class Vtk(FrameFormat):
     """A file per frame; or a `.pvd` that lists the files of a run."""
 
     name: ClassVar[str] = "vtk"
-    summary: ClassVar[str] = "VTK's .vtk, .vtp, .vtu, a file per frame, or .pvd (needs: pip install nmpm[vtk])"
+    summary: ClassVar[str] = 'VTK\'s .vtk, .vtp, .vtu, a file per frame, or .pvd (needs: pip install "nmpm[vtk]")'
     patterns: ClassVar[tuple[str, ...]] = ("*.pvd", "*.vtp", "*.vtu", "*.vtk")
     listing: ClassVar[str] = "*.pvd"
 

@@ -160,7 +160,9 @@ def _check_onnx() -> None:
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
-        raise ConfigError(f"ONNX needs a package that is not installed: pip install nmpm[export] ({error}).") from error
+        raise ConfigError(
+            f'ONNX needs a package that is not installed: pip install "nmpm[export]" ({error}).'
+        ) from error
 
 
 @contextmanager

@@ -61,7 +61,7 @@ def test_a_changing_number_of_particles_is_refused(tmp_path):
 def test_missing_packages_give_the_install_command(tmp_path, monkeypatch):
     path = write(tmp_path / "a.msgpack.zst", frames())
     monkeypatch.setitem(sys.modules, "zstandard", None)
-    with pytest.raises(ConfigError, match=r"pip install 'nmpm\[convert\]'"):
+    with pytest.raises(ConfigError, match=r'pip install "nmpm\[convert\]"'):
         convert(path, tmp_path / "out")
 
 
