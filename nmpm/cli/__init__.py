@@ -30,6 +30,7 @@ COMMANDS = {
     "export": ("nmpm.cli.export", "Write a model as a file that runs without nmpm: ONNX, or AOTInductor's."),
     "render": ("nmpm.cli.render", "Draw trajectories as PNG and GIF or MP4."),
     "view": ("nmpm.cli.view", "Write a page that plays trajectories in a browser."),
+    "doctor": ("nmpm.cli.doctor", "Report on the installation and test it, for help with problems."),
 }
 
 USAGE = """usage: nmpm COMMAND [OPTIONS]

@@ -49,6 +49,7 @@ class Check:
         stated: On the card.
         measured: Now.
         lowest, highest: Of the measured values that pass.
+        stated_by: Words before the stated figure.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Check:
     measured: float
     lowest: float
     highest: float
+    stated_by: str = "the card states"
 
     @property
     def passed(self) -> bool:
@@ -65,7 +67,7 @@ class Check:
     def __str__(self) -> str:
         outcome = "pass" if self.passed else "FAIL"
         return (
-            f"{outcome}  {self.name}: {self.measured:.4g}; the card states {self.stated:.4g}, passes from"
+            f"{outcome}  {self.name}: {self.measured:.4g}; {self.stated_by} {self.stated:.4g}, passes from"
             f" {self.lowest:.4g} to {self.highest:.4g}"
         )
 
