@@ -54,7 +54,7 @@ def test_an_entry_of_a_model_that_reads_noise_states_what_its_members_say(run, s
     ensemble = {"members": 8, "scores": {"density@100": density | {"coverage50": 0.5, "coverage90": 0.8}}}
     (run / "report.json").write_text(json.dumps(report | {"ensemble": ensemble}))
     text = (add(run, "mine") / "README.md").read_text()
-    assert "Fair CRPS ×10⁻³ of 8 members, in units of each quantity" in text
+    assert "Fair CRPS ×10⁻³ of 8 members, beside that of a single rollout" in text
     assert "| density, frame 100 | 40 | 12.3 (10–20) | 0.90 | 0.50 | 0.80 |" in text
     model = Zoo.load("mine")
     assert model.card["ensemble"] == ensemble
