@@ -46,6 +46,7 @@ MARGIN = 10
 PANEL_HEADER = 26
 FOOTER = 26
 STRIP_GAP = 8
+ROOM_FOR_CHARTS = 300
 LINE_HEIGHT = 22
 FONT_SIZE = 13
 LEGEND_DOT = 9
@@ -80,7 +81,7 @@ class FrameRenderer:
         width = MARGIN + columns * (self._panel.width + MARGIN)
         self.width = width + width % 2
         self._members = trajectories.members
-        has_charts = bool(self._members) and trajectories.frame_count > 1
+        has_charts = bool(self._members) and trajectories.frame_count > 1 and self.width >= ROOM_FOR_CHARTS
         self._strip = ChartStrip(trajectories, self.width) if has_charts else None
         # The legend takes a second footer line if it does not fit beside the time.
         time = self._text_width(self._time_text(trajectories.frame_count - 1)) + 2 * MARGIN + 20

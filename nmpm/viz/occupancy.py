@@ -15,8 +15,8 @@ TINTS = (0.18, 0.35, 0.55)
 """Share of the ensemble's colour in these bands, light to dark."""
 SEVERAL: Rgb = (84, 98, 122)
 """The colour of bands where there are several materials."""
-CELL = 0.7
-"""Side of a cell in particle spacings."""
+CELL = 1.0
+"""Side of a cell in particle spacings; with smaller ones, chance gaps in a liquid would count as empty."""
 
 
 def occupied_share(

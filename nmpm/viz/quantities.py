@@ -74,18 +74,20 @@ def mean_height(trajectories: LabelledTrajectories, position: Floats) -> Curve:
 def front(trajectories: LabelledTrajectories, position: Floats) -> Curve:
     """How far the particles have advanced, (T,): the distance across gravity that 95% of them are within.
 
-    It counts from their mean position in the first frame, in all directions without gravity; 0 where no particle is.
+    It counts from their mean position in the first frame with particles, in all directions without gravity; 0 where
+    no particle is.
     """
     position, down = position[:, trajectories.predicted], _down(trajectories)
-    offset = position - np.nanmean(position[0].astype(np.float64), axis=0)
+    there = ~np.isnan(position[..., 0])
+    start = int(there.any(axis=1).argmax())
+    offset = position - position[start, there[start]].astype(np.float64).mean(axis=0)
     for axis, period in enumerate(trajectories.periods):
         if period:
             offset[..., axis] -= period * np.round(offset[..., axis] / period)
     offset -= (offset @ down)[..., None] * down
     distance = np.sort(np.sqrt(np.square(offset).sum(axis=-1)), axis=1)  # (NaN comes last)
-    there = (~np.isnan(distance)).sum(axis=1)
-    index = np.maximum(np.ceil(FRONT * there - 1e-9).astype(int) - 1, 0)
-    return np.where(there > 0, distance[np.arange(len(distance)), index], 0.0)
+    index = np.maximum(np.ceil(FRONT * there.sum(axis=1) - 1e-9).astype(int) - 1, 0)
+    return np.where(there.any(axis=1), distance[np.arange(len(distance)), index], 0.0)
 
 
 def kinetic_energy(trajectories: LabelledTrajectories, position: Floats) -> Curve:

@@ -89,6 +89,7 @@ def test_quantities_have_closed_forms(falling):
     gone[5:, 0] = np.nan
     np.testing.assert_allclose(mean_height(falling, gone), np.linspace(0.7, 0.2, 11))
     np.testing.assert_allclose(front(falling, gone), 0.2)
+    np.testing.assert_allclose(front(falling, np.r_[np.full((3, 2, 2), np.nan), fall])[:4], [0, 0, 0, 0.2])
     around = dataclasses.replace(falling, periodic=(True, False))
     beyond = np.r_[fall[:1], fall[1:] + np.array([0.7, 0])]  # at 0.2 and 0.6 in a box of 0.8
     np.testing.assert_allclose(front(around, beyond), [0.2, *[0.3] * 10])

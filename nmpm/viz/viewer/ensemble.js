@@ -72,7 +72,8 @@ class Ensemble {
       entry.append(`where ${levels.map((level) => `${100 * level}`).join(", ")}% of ${this.members.length} members are`);
       entries.push(entry);
     }
-    if (stride > 1) entries.push(`of the other members, one in ${stride} particles is on this page`);
+    if (stride > 1)
+      entries.push(`one in ${stride} particles of the other members is on this page${this.isDensity ? ", so cells are larger" : ""}`);
     return entries;
   }
 

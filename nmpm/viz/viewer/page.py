@@ -42,6 +42,8 @@ MEMBER_STEPS = 16
 """Steps to which positions of further members are rounded: they take half the room, and nobody sees it."""
 MEMBER_BYTES = 2**26
 """Largest size of further members' positions before they are deflated; beyond it some particles are left out."""
+SPARSE_CELL = 1.4
+"""Side of a cell in spacings of the particles on the page where some are left out: the rest have gaps by chance."""
 MOST_LEFT_OUT = 40
 """At least one in so many particles of a further member is on the page."""
 BAND_TINTS = (0.28, 0.5, 0.75)
@@ -172,7 +174,7 @@ def _describe_motion(trajectories: LabelledTrajectories, positions: dict[str, Fl
         ],
         "bands": {
             "stride": stride,
-            "cell": CELL * min(spacing * stride ** (1 / dim), longest / 20),
+            "cell": (CELL if stride == 1 else SPARSE_CELL) * min(spacing * stride ** (1 / dim), longest / 20),
             "levels": LEVELS,
             "tints": BAND_TINTS,
             "colour": hex_code(ensemble_colour(trajectories.materials)),
