@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import statistics
+import sys
 from typing import Any
 
 import torch
@@ -63,6 +65,12 @@ class EnsembleTest:
             ranks = all_gather(scores.ranks)
             names = dict.fromkeys(name for one in ranks for name in one)
             scores.ranks = {name: torch.stack([one[name] for one in ranks if name in one]).sum(0) for name in names}
+
+    def overall_score(self) -> float:
+        """Geometric mean of the CRPS of the density at the frames that are scored."""
+        means = self.scores.compute()
+        crps = [max(value, sys.float_info.min) for name, value in means.items() if name.startswith("crps_density")]
+        return statistics.geometric_mean(crps)
 
     def to_dict(self) -> dict[str, Any]:
         """The scores as plain data, as reports and cards hold them under `ensemble`.

@@ -17,6 +17,9 @@ from nmpm.scene import Reading
 from nmpm.training.backpropagation import MOST_PARTS, on_threads, split_rows
 from nmpm.training.preflight import OVERALL
 
+VALIDATED = 4
+"""Members of each scene in validations of ensembles."""
+
 
 class EvaluatedModule(LightningModule):
     """Rolls an emulator out over whole trajectories and logs the errors; training is the subclass's.
@@ -32,8 +35,9 @@ class EvaluatedModule(LightningModule):
         threads: How many threads compute them; None for one each. Changes no result.
         compiled: Whether torch compiles the network, so that batches are not computed in parts.
         reading: How the data are read for the emulator; errors count frames of the data.
+        members: Members that are trained; where there are several, the overall error of validations is their CRPS.
         tested_members: Members of which tests measure scores, too; None for none.
-        ensemble: These scores, in tests of members.
+        ensemble: These scores, in tests of members and in validations of ensembles.
     """
 
     def __init__(self, emulator: Emulator, horizon: int, metrics: Sequence[RolloutMetric] | None) -> None:
@@ -43,6 +47,7 @@ class EvaluatedModule(LightningModule):
         self.threads: int | None = None
         self.compiled = False
         self.reading = Reading(emulator.scene)
+        self.members = 1
         self.tested_members: int | None = None
         self.ensemble: EnsembleTest | None = None
         reported = [MSE()] if metrics is None else list(metrics)
@@ -59,16 +64,21 @@ class EvaluatedModule(LightningModule):
 
     def validation_step(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
         predicted = self._predict(batch)
+        self._score_members(batch, predicted)
         self.valid_errors.update(batch, predicted.position, predicted.fields)
 
     def test_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
         with torch.autocast(self.device.type, enabled=False):  # in the precision that trained models are used in
             predicted = self._predict(batch)
-            if self.ensemble is not None:
-                for row in range(len(batch.frames)):
-                    self.ensemble.update(batch.scenes([row]), predicted.position[[row]])
+            self._score_members(batch, predicted)
         self.test_errors.update(batch, predicted.position, predicted.fields)
         return predicted.position
+
+    def _score_members(self, batch: Window, predicted: Rollout) -> None:
+        """Add the scores of members, if they are asked for, beside the one rollout."""
+        if self.ensemble is not None:
+            for row in range(len(batch.frames)):
+                self.ensemble.update(batch.scenes([row]), predicted.position[[row]])
 
     def predict_step(self, batch: Window, batch_idx: int) -> Tensor | Rollout:  # noqa: ARG002
         """(B, T - 2, N, D) predicted positions; with the fields where the scene has any that evolve."""
@@ -98,16 +108,23 @@ class EvaluatedModule(LightningModule):
 
     def on_validation_epoch_start(self) -> None:
         self.valid_errors.reset()
+        self._start_ensemble(VALIDATED if self.members > 1 else None)
 
     def on_test_epoch_start(self) -> None:
         self.test_errors.reset()
-        if self.tested_members is not None:
-            self.ensemble = EnsembleTest(self.emulator, self.tested_members, every=self.reading.every)
+        self._start_ensemble(self.tested_members)
+
+    def _start_ensemble(self, members: int | None) -> None:
+        every = self.reading.every
+        self.ensemble = None if members is None else EnsembleTest(self.emulator, members, every=every)
 
     def on_validation_epoch_end(self) -> None:
         errors = self.valid_errors.compute()
         horizon = self.horizon * self.reading.every // self.reading.between  # in frames of the data
         overall = overall_error(errors, max(1, horizon))
+        if self.ensemble is not None:
+            self.ensemble.gather()
+            overall = torch.tensor(self.ensemble.overall_score(), device=self.device)
         self.log_dict({f"valid/{name}": value for name, value in (errors | {OVERALL: overall}).items()})
 
     def on_test_epoch_end(self) -> None:

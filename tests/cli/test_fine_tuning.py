@@ -8,6 +8,7 @@ import torch
 
 from nmpm import TrajectoryDataModule
 from nmpm.cli import main
+from nmpm.processors import Stochastic
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.zoo import Zoo
 
@@ -54,6 +55,17 @@ def weights_of(run: str) -> dict[str, torch.Tensor]:
 
 def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
     return all(torch.equal(values, other[name]) for name, values in one.items())
+
+
+def test_an_ensemble_goes_on_from_a_deterministic_model_and_is_judged_by_its_members(fit):
+    fit("first", 1, 1e-3)
+    report = fit("members", 2, 1e-3, "--start_from", "first", "--model.members", "2", "--trainer.max_steps", "2")
+    assert isinstance(Zoo.load("members").emulator.recipe.processor, Stochastic)
+    assert len(report["curve"]) == 3  # the start counts
+    assert main(["fit", "--resume", "members", "--trainer.max_steps", "3"]) == 0
+    assert main(["test", "members", "--members", "3"]) == 0
+    report = json.loads(Path("members", "report.json").read_text())
+    assert report["ensemble"]["members"] == 3
 
 
 def test_a_training_that_makes_it_worse_keeps_the_start(fit, capsys):
