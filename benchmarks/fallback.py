@@ -1,6 +1,6 @@
 """Price and error of rollouts that a simulator continues, beside the emulator alone and the simulator's own restart.
 
-    python benchmarks/fallback.py waterramps --scenes 8 [--data ramps]
+    python benchmarks/fallback.py waterramps ramps --scenes 8
 
 For each test scene the emulator predicts until it is no longer trusted; the simulator goes on from there. *Restart* is
 the simulator from the recorded state at that frame, which lacks strain and pressure likewise. Errors are those of
@@ -12,18 +12,23 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from nmpm.data.format import Split, read_metadata
+from nmpm.data.loading.evaluation import EvaluationLoader
+from nmpm.data.loading.recording import SplitRecordings
 from nmpm.evaluation.prediction_errors import field_error
 from nmpm.particles import Window
-from nmpm.scene import Scene
+from nmpm.scene import Reading, Scene
 from nmpm.zoo import Pretrained, load_model
 from nmpm.zoo.fallback import fitting_preset, predict_trusted, simulate_on
-from nmpm.zoo.measures.scenes import iterate_scenes, simulator_of
+from nmpm.zoo.measures.scenes import simulator_of
 
 COLUMNS = ("MSE ×10⁻³", "field, mean", "field, last")
 
@@ -32,14 +37,14 @@ def main(words: list[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("model")
+    parser.add_argument("data", type=Path, help="folder of its data, from nmpm simulate")
     parser.add_argument("--scenes", type=int, default=8)
-    parser.add_argument("--frames", type=int, help="of each scene (default: all)")
-    parser.add_argument("--data", type=Path, help="folder of the data (default: simulated)")
+    parser.add_argument("--at", type=int, help="frame at which the simulator takes over (default: the last trusted)")
     options = parser.parse_args(words)
     torch.set_num_threads(1)
     model = load_model(options.model)
-    scenes = iterate_scenes("fallback", model, options.data, options.scenes, options.frames)
-    rows = [row for window in scenes if (row := measured(model, window)) is not None]
+    scenes = islice(windows(options.data / "test.h5", model), options.scenes)
+    rows = [row for window in scenes if (row := measured(model, window, options.at)) is not None]
     if not rows:
         sys.stdout.write("no scene is lost\n")
         return
@@ -54,12 +59,18 @@ def main(words: list[str] | None = None) -> None:
     sys.stdout.write("\n")
 
 
+def windows(file: Path, model: Pretrained) -> Iterator[Window]:
+    """The scenes of a split, one at a time."""
+    recordings = SplitRecordings(Split(file), read_metadata(file.parent, "deepmind"), Reading(model.scene))
+    yield from EvaluationLoader(recordings, 1)
+
+
 def mean(rows: list[dict[str, float | list[float]]], name: str) -> float:
     """The mean of a column."""
     return float(np.mean([row[name] for row in rows]))
 
 
-def measured(model: Pretrained, window: Window) -> dict[str, float | list[float]] | None:
+def measured(model: Pretrained, window: Window, at: int | None) -> dict[str, float | list[float]] | None:
     """Errors and times of one scene; None if it is trusted to its end."""
     scene, state, target = model.scene, window.initial, window.target
     preset, frames = fitting_preset(scene, state, simulator_of(model)), target.shape[1]
@@ -67,7 +78,7 @@ def measured(model: Pretrained, window: Window) -> dict[str, float | list[float]
     alone = model.rollout(state, frames)
     single = time.process_time() - begun
     trusted = predict_trusted(model.emulator, model.trust, state, frames)
-    watched, last = time.process_time() - begun - single, int(trusted.trusted[0])
+    watched, last = time.process_time() - begun - single, at or int(trusted.trusted[0])
     if last in (0, frames):
         return None
     path = torch.cat([state.position[:, None], alone], dim=1)

@@ -34,6 +34,7 @@ ROOMS = (
     "nmpm.emulator",
     "nmpm.emulator.constraints",
     "nmpm.emulator.monitor",
+    "nmpm.emulator.trust",
     "nmpm.obstacles",
     "nmpm.training.losses",
     "nmpm.processors",

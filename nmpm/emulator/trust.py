@@ -46,11 +46,12 @@ class Trust:
 
     Args:
         limit: Mean disagreement of members beyond which a rollout is not trusted.
-        error: Error of the trusted frame as a share of it, that 68% of the validation scenes are within.
+        error: Error of the trusted frame as a share of it, that 68% of the validation scenes are within, of those that
+            are lost before their end; the default where none is.
         scenes: Validation scenes of the calibration; 0 where there was none, and limit and error are `waterramps`'.
     """
 
-    limit: float = 0.053
+    limit: float = 0.058
     error: float = 0.2
     scenes: int = 0
 
@@ -77,12 +78,14 @@ class Trust:
         """
         if not members:
             raise DataError("Trust is calibrated on one recorded scene or more, and there is none.")
-        right = torch.tensor([max(1, frames_below(curve, ERROR)) for curve in truth], dtype=torch.float64)
+        right = _frames(truth, ERROR)
         distances = {limit: (_frames(members, limit) / right).log().abs().mean().item() for limit in _LIMITS}
         least = min(distances.values()) + 1e-9
         limit = min((one for one in _LIMITS if distances[one] <= least), key=lambda one: abs(one - cls.limit))
-        errors = (_frames(members, limit) / right - 1).abs()
-        return cls(round(limit, 4), round(max(0.01, float(errors.quantile(_WITHIN))), 3), len(members))
+        predicted, whole = _frames(members, limit), torch.tensor([len(curve) for curve in truth])
+        errors = (predicted / right - 1).abs()[(predicted < whole) | (right < whole)]
+        error = max(0.01, round(float(errors.quantile(_WITHIN)), 3)) if len(errors) else cls.error
+        return cls(round(limit, 4), error, len(members))
 
     def to_card(self) -> dict[str, Any]:
         """The section `trust` of a card."""
@@ -97,6 +100,7 @@ class Trust:
 
 
 def _frames(curves: Sequence[Tensor], limit: float) -> Tensor:
+    """(S,) the last frame of each curve below a limit, at least 1."""
     return torch.tensor([max(1, frames_below(curve, limit)) for curve in curves], dtype=torch.float64)
 
 

@@ -128,7 +128,9 @@ def test_the_limit_is_that_by_which_frames_are_nearest_to_the_true_ones():
     assert fitted.error < 0.05
     assert fitted.scenes == 3
     calm = [torch.full((50,), 0.01)]
-    assert Trust.fit(calm, calm).limit == pytest.approx(Trust().limit, rel=0.05)
+    never_lost = Trust.fit(calm, calm)
+    assert never_lost.limit == pytest.approx(Trust().limit, rel=0.05)
+    assert never_lost.error == Trust().error
     with pytest.raises(DataError, match="one recorded scene or more"):
         Trust.fit([], [])
 

@@ -279,4 +279,4 @@ def test_trust_is_calibrated_on_the_validation_scenes(goop):
     model = load_model(goop)
     assert model.trust.scenes == 2
     assert model.trust.to_card() == model.card["trust"]
-    assert "in 68% of 2 validation scenes" in (goop / "README.md").read_text()
+    assert "(2 validation scenes; `nmpm rollout" in (goop / "README.md").read_text()
