@@ -32,7 +32,7 @@ from nmpm import Zoo
 from nmpm.cli.options import choose_threads
 model = Zoo.load("goop")
 choose_threads(model, int(sys.argv[1]) or None)
-state, seconds = model.example(), []
+state, seconds = model.example(count=1000), []
 for _ in range(6):
     start = time.perf_counter()
     model.rollout(state, 400)

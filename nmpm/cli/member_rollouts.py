@@ -17,8 +17,8 @@ from rich.console import Console
 from torch import Tensor
 
 from nmpm._support.progress import progress_bar
+from nmpm.cli.prediction import kept_frames, milliseconds, predicted
 from nmpm.cli.recorded_start import compared, recorded_errors
-from nmpm.cli.rollout import kept_frames, trajectory_of
 from nmpm.data.described import described_metadata
 from nmpm.data.format import MEMBER, Trajectory
 from nmpm.data.write import find_writer, write_trajectories
@@ -82,15 +82,14 @@ class MemberRollouts:
         stream = stream_watched(
             emulator, state, steps, tracker, members, self.options.seed, self._nudge, given, monitor
         )
-        times = []
+        times = [time.perf_counter()]
         with progress_bar(f"{members} members", -(-steps // emulator.frames)) as step:
             for part in kept_frames(stream, self.between):
                 times.append(time.perf_counter())
                 frames.add(part)
                 step()
-        each = 1000 * np.diff(times) / (emulator.frames * members)  # without the first call, which may compile
-        cost = f", {np.mean(each):.3g} ms per frame and member" if len(each) else ""
-        sys.stdout.write(f"{members} members{cost}: {monitor.report()}\n")
+        cost = milliseconds(times, emulator.frames / self.between * members)
+        sys.stdout.write(f"{members} members, {cost:.3g} ms per frame and member: {monitor.report()}\n")
 
     def _write(self, frames: MemberFrames) -> list[Path]:
         """Write a trajectory for each member; the files."""
@@ -101,7 +100,7 @@ class MemberRollouts:
         def trajectory(member: int) -> Trajectory:
             start = self.written.with_motion(starts.position[[member]], self.written.velocity)
             rollout = frames.member(member)
-            made = trajectory_of(self.model, self.scene, start, rollout, self.window, self.options)
+            made = predicted(self.model, self.options.model, self.scene, start, rollout, self.window)
             return replace(made, attributes=made.attributes | {MEMBER: member})
 
         first = trajectory(0)

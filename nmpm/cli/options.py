@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nmpm._support.atomic import file_obstacle, folder_obstacle, name_obstacle
+from nmpm._support.messages import suggestion
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -149,6 +150,26 @@ def check_exists(option: str, path: Path) -> None:
     """Raise ConfigError if there is no such file or folder."""
     if obstacle := name_obstacle(path) or ("" if path.exists() else "there is no such file or folder."):
         raise ConfigError(f"{option} {path}: {obstacle}")
+
+
+def check_data(option: str, data: Path) -> None:
+    """Raise ConfigError if data are neither a file or folder nor an embedded dataset."""
+    from nmpm.data.catalog import catalog
+
+    if not data.exists() and str(data) not in catalog():
+        names = f"there is no such file or folder, nor an embedded dataset of that name: {', '.join(catalog())}."
+        raise ConfigError(f"{option} {data}: {name_obstacle(data) or names + suggestion(str(data), catalog())}")
+
+
+def find_data(data: Path, split: str | None, index: int) -> Path:
+    """The file or folder of data; of an embedded dataset the folder, simulated first if it lacks the trajectory."""
+    from nmpm.data.catalog import ensure, find_simulated
+
+    if data.exists():
+        return data
+    counts = {"train": 0, "valid": 0, "test": 0} | {split or "test": index + 1}
+    simulated = find_simulated(str(data), index + 1) if split in (None, "test") else None
+    return simulated or ensure(str(data), counts)
 
 
 def derived_name(path: Path, suffix: str) -> Path:

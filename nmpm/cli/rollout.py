@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,29 +19,30 @@ from nmpm.cli.options import (
     add_split_option,
     add_threads_option,
     check_at_least,
+    check_data,
     check_device,
-    check_exists,
     choose_threads,
     data_options,
+    find_data,
     gravity_option,
     stated_facts,
 )
-from nmpm.data.write import find_writer, write_trajectory
+from nmpm.data.write import find_writer
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from nmpm.data.format import Trajectory
     from nmpm.emulator import Prescribed, Rollout
-    from nmpm.particles import Particles, Window
-    from nmpm.scene import Scene
+    from nmpm.particles import Particles
     from nmpm.zoo import Pretrained
 
 FRAMES = 400
-"""Predicted of thrown blocks, unless an option says otherwise."""
+"""Predicted without a recording, unless an option says otherwise."""
 
 _EXAMPLES = """\
 examples:
-  nmpm rollout goop --frames 400 --out out.h5            a zoo model, from thrown blocks
+  nmpm rollout waterramps --frames 400 --out out.h5      a zoo model, in a scene of its simulator
+  nmpm rollout waterramps --blocks 3 --seed 1            from thrown blocks
+  nmpm rollout waterramps --data waterramps              from a test scene, beside the simulation
   nmpm rollout runs/goop --data test.h5 --trajectory 3   a run's best, from a recorded start
   nmpm rollout runs/grains --data grains.npz             or from any other form of data
   nmpm rollout sandramps --data grains --materials big=sand,small=sand
@@ -66,20 +66,22 @@ def run(words: list[str]) -> None:
     from nmpm.zoo.registry import load_model
 
     model = load_model(options.model, options.device, options.root)
-    hint = _from_blocks(model, options) if options.data is None else _from_recording(model, options)
+    hint = _from_scene(model, options) if options.data is None else _from_recording(model, options)
     sys.stdout.write(f"to look at them: {hint}\n")
 
 
-def _from_blocks(model: Pretrained, options: argparse.Namespace) -> str:
-    """Roll out from thrown blocks; return how to look at what is written."""
+def _from_scene(model: Pretrained, options: argparse.Namespace) -> str:
+    """Roll out from a scene of the model's training, or from thrown blocks; return how to look at what is written."""
+    from nmpm.cli.prediction import predicted, write_prediction
+
     model = _optimized(model, options)
-    state, frames = _thrown_state(model, options), options.frames or FRAMES
+    state, frames = _start_state(model, options), options.frames or FRAMES
     if options.members is not None:
         from nmpm.cli.member_rollouts import MemberRollouts
 
         return MemberRollouts(model, model.scene, state, state, frames, options).run()
-    rollout = predict(model, state, None, frames, options)
-    return _write(model, model.scene, state, rollout, None, options)
+    rollout = _predict(model, state, frames, options)
+    return write_prediction(options.out, predicted(model, options.model, model.scene, state, rollout))
 
 
 def _from_recording(model: Pretrained, options: argparse.Namespace) -> str:
@@ -87,25 +89,75 @@ def _from_recording(model: Pretrained, options: argparse.Namespace) -> str:
     from rich.console import Console
 
     from nmpm.cli.member_rollouts import MemberRollouts
+    from nmpm.cli.prediction import predicted, write_prediction
     from nmpm.cli.recorded_start import RecordedStart, compared, recorded_errors
     from nmpm.emulator import Prescribed
     from nmpm.evaluation.figures import error_table
 
+    options.data = find_data(options.data, options.split, options.trajectory)
     start = RecordedStart.of(model, options)
     model, written = _optimized(start.model, options), start.written
     recorded = written.target.shape[1]
     frames = options.frames or recorded or FRAMES
     prescribed, window = Prescribed.of(start.window), written if recorded else None
+    state = start.window.initial
     if options.members is not None:
-        states = start.window.initial, written.initial
-        members = MemberRollouts(model, start.scene, *states, frames, options, start.between, prescribed, window)
-        return members.run(predict(model, states[0], prescribed, frames, options, start.between) if recorded else None)
-    rollout = predict(model, start.window.initial, prescribed, frames, options, start.between)
-    hint = _write(model, start.scene, written.initial, rollout, window, options)
+        members = MemberRollouts(
+            model, start.scene, state, written.initial, frames, options, start.between, prescribed, window
+        )
+        single = _predict(model, state, frames, options, prescribed, start.between) if recorded else None
+        return members.run(single)
+    rollout = _predict(model, state, frames, options, prescribed, start.between)
+    trajectory = predicted(model, options.model, start.scene, written.initial, rollout, window)
+    hint = write_prediction(options.out, trajectory)
     if recorded:
         bundle, what = max(1, model.emulator.frames // start.between), compared(written, rollout, options)
         Console().print(error_table(what, recorded_errors(start.scene, bundle, written, [rollout])))
     return hint
+
+
+def _predict(
+    model: Pretrained,
+    state: Particles,
+    frames: int,
+    options: argparse.Namespace,
+    prescribed: Prescribed | None = None,
+    between: int = 1,
+) -> Rollout:
+    """So many frames, or as many as are trusted."""
+    if options.until or options.fallback:
+        from nmpm.cli.trusted_rollout import predict_trusted
+
+        return predict_trusted(model, state, prescribed, frames, options, between)
+    from nmpm.cli.prediction import predict
+
+    return predict(model, state, frames, options.watch, prescribed, between)
+
+
+def _start_state(model: Pretrained, options: argparse.Namespace) -> Particles:
+    """A scene of the model's training, or thrown blocks; what it is is printed."""
+    from nmpm.zoo.scenes import training_preset
+    from nmpm.zoo.starts import THROWN
+
+    gravity, preset = gravity_option(options.gravity), training_preset(model)
+    thrown = options.particles is not None or options.blocks is not None
+    if not thrown and preset is not None:
+        state = model.example(options.seed, gravity=gravity)
+        solid = ", with obstacles" if state.obstacle.shape[1] else ""
+        count = state.position.shape[1]
+        sys.stdout.write(f"Scene of {preset.name}, seed {options.seed}: {count:,} particles{solid}.\n")
+        return state
+    if not thrown:
+        sys.stdout.write(
+            f"No preset has the scenes that {options.model} was trained on: about {THROWN:,} particles are thrown into"
+            " its box. --data starts from a recorded scene.\n"
+        )
+    count = THROWN if options.particles is None else options.particles
+    try:
+        return model.example(options.seed, count, options.blocks, gravity)
+    except ConfigError as error:
+        blocks = "" if options.blocks is None else f" --blocks {options.blocks}"
+        raise ConfigError(f"--particles {count}{blocks}: {error}") from error
 
 
 def _optimized(model: Pretrained, options: argparse.Namespace) -> Pretrained:
@@ -117,7 +169,8 @@ def _optimized(model: Pretrained, options: argparse.Namespace) -> Pretrained:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="nmpm rollout",
-        description="Roll a trained model out, from thrown blocks of particles or from a recorded trajectory.",
+        description="Roll a trained model out: in a scene as those of its training, from thrown blocks of particles, or"
+        " from a recorded trajectory.",
         epilog=_EXAMPLES,
         formatter_class=HelpFormatter,
     )
@@ -129,14 +182,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--data",
         type=Path,
-        help="start from a trajectory of this file or folder, of any format that nmpm inspect reads, and print the"
-        " error",
+        help="start from a trajectory of this file or folder, of any format that nmpm inspect reads, or of an embedded"
+        " dataset (goop, …); write it beside the prediction, and print the error",
     )
     add_split_option(parser, "--data")
     add_match_options(parser)
     add_data_options(parser)
     parser.add_argument("--trajectory", type=int, default=0, help="index in --data (default: 0, the first)")
-    parser.add_argument("--seed", type=int, default=0, help="of the thrown blocks, and of members (default: 0)")
+    parser.add_argument("--seed", type=int, default=0, help="of the scene, and of members (default: 0)")
     parser.add_argument(
         "--members",
         type=int,
@@ -154,8 +207,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--fallback", metavar="PRESET", help="simulate the frames after the last trusted one, see nmpm simulate --list"
     )
-    parser.add_argument("--particles", type=int, default=1000, help="approximate number to throw (default: 1000)")
-    parser.add_argument("--blocks", type=int, help="number of blocks (default: one of each material)")
+    parser.add_argument("--particles", type=int, help="throw blocks of about so many in all (with --blocks: 1000)")
+    parser.add_argument("--blocks", type=int, help="throw so many blocks (with --particles: one of each material)")
     parser.add_argument(
         "--precision",
         choices=["float32", "bfloat16"],
@@ -179,7 +232,7 @@ def _check(options: argparse.Namespace) -> None:
     match = MatchOptions.read(options.materials, options.stride, options.strict)
     data_options(options)
     if options.data is not None:
-        check_exists("--data", options.data)
+        check_data("--data", options.data)
     elif match != MatchOptions():
         raise ConfigError("--materials, --stride and --strict are about recorded data: give --data too.")
     elif facts := [fact for fact in stated_facts(options) if not fact.startswith("--gravity")]:
@@ -200,95 +253,3 @@ def _check_members(options: argparse.Namespace) -> None:
     writer = find_writer("--out", options.out)
     for path in writer.paths(options.out, options.members or 0):
         find_writer("--out", path)
-
-
-def _thrown_state(model: Pretrained, options: argparse.Namespace) -> Particles:
-    gravity = gravity_option(options.gravity)
-    try:
-        return model.example(options.seed, options.particles, options.blocks, gravity)
-    except ConfigError as error:
-        blocks = "" if options.blocks is None else f" --blocks {options.blocks}"
-        raise ConfigError(f"--particles {options.particles}{blocks}: {error}") from error
-
-
-def predict(
-    model: Pretrained,
-    state: Particles,
-    prescribed: Prescribed | None,
-    frames: int,
-    options: argparse.Namespace,
-    between: int = 1,
-) -> Rollout:
-    """So many frames, of which the model makes `between` each; all but every last of them are left out."""
-    if options.until or options.fallback:
-        from nmpm.cli.trusted_rollout import predict_trusted
-
-        return predict_trusted(model, state, prescribed, frames, options, between)
-    from nmpm._support.progress import progress_bar
-    from nmpm.emulator import Rollout, stream_rollout
-    from nmpm.emulator.input_checks import warn_of_start_outside
-    from nmpm.emulator.monitor import Monitor, Policy
-
-    monitor, parts, steps = Monitor(Policy(options.watch)), [], frames * between
-    start, given = state.to(model.emulator.device), prescribed and prescribed.to(model.emulator.device)
-    warn_of_start_outside(model.emulator, start)
-    with progress_bar("rollout", -(-steps // model.emulator.frames)) as step:
-        for part in kept_frames(stream_rollout(model.emulator, start, steps, monitor, given), between):
-            parts.append(part)
-            step()
-    sys.stdout.write(monitor.report() + "\n")
-    return Rollout.join(parts)
-
-
-def kept_frames(parts: Iterable[Rollout], between: int) -> Iterator[Rollout]:
-    """Every `between`-th frame of the parts of a rollout, on the CPU."""
-    first = between - 1
-    for part in parts:
-        kept = slice(first, None, between)
-        fields = {name: values[:, kept].cpu() for name, values in part.fields.items()}
-        yield part._replace(position=part.position[:, kept].cpu(), fields=fields)
-        first = (first - part.position.shape[1]) % between
-
-
-def trajectory_of(
-    model: Pretrained,
-    scene: Scene,
-    start: Particles,
-    rollout: Rollout,
-    window: Window | None,
-    options: argparse.Namespace,
-) -> Trajectory:
-    """The start and the prediction of one scene, beside what was recorded."""
-    from nmpm.data.predictions import predicted_trajectory
-
-    origin = f"the zoo model {options.model}" if "sha256" in model.card else f"the model {options.model}"
-    return predicted_trajectory(
-        scene,
-        start,
-        rollout.position,
-        origin,
-        fields=rollout.fields,
-        truth=None if window is None else window.recorded[:, : rollout.position.shape[1] + 2],
-        real=None if window is None else window.mask,
-        obstacle_frames=None if window is None else window.obstacle_frames,
-    )
-
-
-def _write(
-    model: Pretrained,
-    scene: Scene,
-    state: Particles,
-    rollout: Rollout,
-    window: Window | None,
-    options: argparse.Namespace,
-) -> str:
-    """Write the start and the prediction, beside what was recorded; return how to look at them."""
-    from nmpm.data.described import described_metadata
-
-    start = state.to("cpu")
-    predicted = trajectory_of(model, scene, start, rollout, window, options)
-    metadata = described_metadata(predicted.attributes, options.out, len(predicted.position))
-    file = write_trajectory(options.out, predicted, metadata)
-    frames = f"2 frames of the start and {rollout.position.shape[1]} predicted"
-    sys.stdout.write(f"wrote {frames}, of {start.position.shape[1]} particles, to {file}\n")
-    return find_writer("--out", options.out).hint(file)

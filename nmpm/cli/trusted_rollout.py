@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 
 from nmpm._support.progress import progress_bar
-from nmpm.cli.rollout import kept_frames
+from nmpm.cli.prediction import kept_frames
 from nmpm.emulator import Prescribed, Rollout
 from nmpm.emulator.input_checks import warn_of_start_outside
 from nmpm.emulator.monitor import Monitor, Policy

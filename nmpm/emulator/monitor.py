@@ -24,8 +24,12 @@ _READ_EVERY = 16  # bundles, where reading measures back halts the device
 _AT_WALLS, _CROWDING_LIMIT, _RESTING = "particles at the walls", "crowding limit", "at rest"
 
 
+_UNITS = {"speed": "{:.3g} cells per frame", "energy": "{:+.1%}", "crowding": "{:.3g} times a cell's volume"}
+"""How measures are printed."""
+
+
 class Policy(Enum):
-    """Reaction of a monitor to a limit that is passed."""
+    """Reaction of a monitor to a limit that is exceeded."""
 
     WARN = "warn"
     STOP = "stop"
@@ -33,12 +37,12 @@ class Policy(Enum):
 
 
 class RolloutStoppedError(NmpmError):
-    """A rollout passed a limit of its monitor; the frames predicted until then have been yielded."""
+    """A rollout exceeded a limit of its monitor; the frames predicted until then have been yielded."""
 
 
 @dataclass(frozen=True)
 class Incident:
-    """A limit passed for the first time in a rollout, by the last frame of a bundle, from 1, in a scene of the batch.
+    """A limit exceeded for the first time in a rollout, by the last frame of a bundle, from 1, in a scene of the batch.
 
     `what` is "speed", "energy", "crowding" or "not finite".
     """
@@ -50,7 +54,11 @@ class Incident:
     limit: float
 
     def __str__(self) -> str:
-        return f"{self.what} {self.value:.4g} (limit {self.limit:.4g}) in scene {self.scene} by frame {self.frame}"
+        where = f"in scene {self.scene} by frame {self.frame}"
+        if self.what not in _UNITS:
+            return f"{self.what} {where}"
+        value, limit = (_UNITS[self.what].format(number) for number in (self.value, self.limit))
+        return f"{self.what} {value} (limit {limit.split()[0]}) {where}"
 
 
 @dataclass
@@ -189,7 +197,7 @@ class Monitor:
         if self.policy is Policy.STOP:
             raise RolloutStoppedError(f"The rollout was stopped: {incident}. {self.report()}")
         if self.policy is Policy.WARN:
-            warnings.warn(f"The rollout passed a limit: {incident}.", stacklevel=6)
+            warnings.warn(f"The rollout exceeded a limit: {incident}.", stacklevel=6)
 
     def gather(self, parts: Sequence[Monitor]) -> None:
         """Adopt what monitors of the parts of a batch, of about as many scenes each, have measured."""
@@ -205,8 +213,8 @@ class Monitor:
 
     def report(self) -> str:
         """A summary of the rollout in a sentence or two."""
-        seen = ", ".join(f"{what} {value:.3g}" for what, value in self.peaks.items() if what != "not finite")
-        passed = "; ".join(map(str, self.incidents)) or "none"
+        seen = ", ".join(f"{what} {_UNITS[what].format(value)}" for what, value in self.peaks.items() if what in _UNITS)
+        exceeded = "; ".join(map(str, self.incidents)) or "none"
         still = f"{self.at_walls} particles at the walls, {self.rest_share:.0%} of all at rest on average"
         trust = f" {self.trust}" if self.trust else ""
-        return f"{self._frames} frames; most: {seen}; {still}. Limits passed: {passed}.{trust}"
+        return f"{self._frames} frames. At most: {seen}; {still}. Limits exceeded: {exceeded}.{trust}"

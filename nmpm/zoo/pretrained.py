@@ -29,7 +29,7 @@ from nmpm.zoo.card import preset_of
 from nmpm.zoo.matching import match_data
 from nmpm.zoo.optimization import AUTO, optimize, small_example
 from nmpm.zoo.predictor import Predictor
-from nmpm.zoo.starts import state_of, thrown_state
+from nmpm.zoo.starts import THROWN, state_of, thrown_state
 from nmpm.zoo.states import TOO_FAST, Bodies, StateBuilder
 
 if TYPE_CHECKING:
@@ -144,24 +144,32 @@ class Pretrained(Predictor):
     def example(
         self,
         seed: int = 0,
-        count: int = 1000,
+        count: int | None = None,
         blocks: int | None = None,
         gravity: ArrayLike | Tensor | None = None,
     ) -> Particles:
-        """A state to start from: blocks of particles thrown into the scene's box.
+        """A state to start from: a scene of the preset that the model was trained on, with its obstacles.
+
+        With `count` or `blocks`, and where no shipped preset has the model's scenes, blocks of particles thrown into
+        the scene's box.
 
         Args:
-            seed: Of places and velocities, 0 or more.
-            count: Approximate number of particles.
-            blocks: Number of blocks; one of each material when left out.
-            gravity: (D,), as for `state`; where it varies and is left out, downwards along the second axis, as strong
-                as in the root mean square of the training.
+            seed: Of the scene, 0 or more.
+            count: Approximate number of thrown particles; 1000 when only `blocks` is given.
+            blocks: Number of thrown blocks; one of each material when only `count` is given.
+            gravity: (D,), as for `state`. Where it varies and is left out, it is drawn with the scene; of thrown blocks
+                downwards along the second axis, as strong as in the root mean square of the training.
 
         Raises:
             ConfigError: if a number is too small, or the blocks do not fit into the box.
             DataError: if gravity is not the model's.
         """
-        return thrown_state(self, seed, count, blocks, gravity)
+        from nmpm.zoo.scenes import drawn_state, training_preset  # (the simulators compile kernels by numba)
+
+        preset = training_preset(self) if count is None and blocks is None else None
+        if preset is None:
+            return thrown_state(self, seed, THROWN if count is None else count, blocks, gravity)
+        return drawn_state(self, preset, seed, gravity)
 
     def with_network(self, precision: str) -> Pretrained:
         """The same model with the network's weights in "float32" or, faster on most processors, in "bfloat16"."""

@@ -27,6 +27,8 @@ from nmpm.zoo.states import StateBuilder
 if TYPE_CHECKING:
     from nmpm.zoo.pretrained import Pretrained
 
+THROWN = 1000
+"""Particles of thrown blocks, about, unless their number is given."""
 _SAME_GRAVITY = 0.05
 """Share of the model's gravity by which that of data may differ, as it may be measured."""
 

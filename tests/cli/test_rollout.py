@@ -1,3 +1,4 @@
+import re
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -7,8 +8,11 @@ import pytest
 from nmpm import Zoo, load_trajectories
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
+from nmpm.data import catalog
 from nmpm.data.format import Split, read_metadata
+from nmpm.data.generate import generate
 from nmpm.emulator.trust import Trust
+from nmpm.sim import load_preset
 from nmpm.viz.files import read_labelled
 from nmpm.zoo.predictor import Predictor
 
@@ -24,13 +28,46 @@ def test_names_and_paths_give_the_same_rollout(folder, capsys):
     (folder / "copy").symlink_to(shipped_folder("zoo") / "goop")
     few = ["--frames", "20", "--particles", "50"]
     assert main(["rollout", "goop", *few, "--out", "a.h5"]) == 0
-    assert "20 frames; most" in capsys.readouterr().out
+    assert "20 frames. At most: speed" in capsys.readouterr().out
     assert main(["rollout", "./copy", *few, "--out", "b.h5"]) == 0
     assert main(["rollout", "goop", "--root", str(shipped_folder("zoo")), *few, "--out", "c.h5"]) == 0
     a, b, c = (Split(folder / f"{name}.h5").read(0).position for name in "abc")
     assert a.shape[0] == 22
     np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(a, c)
+
+
+def test_a_rollout_is_of_the_scene_of_its_model_unless_blocks_are_asked_for(folder, capsys):
+    """Waterramps came without ramps, and with another number of particles than its own."""
+    state = Zoo.load("waterramps").example(seed=2)
+    assert main(["rollout", "waterramps", "--frames", "9", "--seed", "2"]) == 0
+    said = capsys.readouterr().out
+    assert f"Scene of waterramps, seed 2: {state.position.shape[1]:,} particles, with obstacles." in said
+    assert re.search(r"[\d.]+ ms per frame on .* threads?\.", said)
+    written = Split(folder / "out.h5").read(0)
+    np.testing.assert_allclose(written.position[1], np.concatenate([state.position[0], state.obstacle[0]]), atol=1e-6)
+    assert main(["rollout", "waterramps", "--frames", "2", "--blocks", "2"]) == 0
+    assert "Scene of" not in capsys.readouterr().out
+    assert Split(folder / "out.h5").particles(0) == 968
+    assert main(["rollout", "waterdrop", "--frames", "2"]) == 0
+    assert "No preset has the scenes that waterdrop was trained on: about 1,000 particles" in capsys.readouterr().out
+
+
+def test_a_rollout_takes_the_name_of_a_dataset_and_stores_the_truth_beside(folder, monkeypatch, capsys):
+    asked = []
+    made = make_goop(folder / "made")
+    monkeypatch.setattr(catalog, "ensure", lambda name, counts: asked.append((name, counts)) or made)
+    assert main(["rollout", "goop", "--data", "goop", "--trajectory", "1", "--frames", "2"]) == 0
+    assert asked == [("goop", {"train": 0, "valid": 0, "test": 2})]
+    assert "beside the recording, to out.h5" in capsys.readouterr().out
+    assert list(read_labelled(Split(folder / "out.h5")).positions) == ["truth", "prediction"]
+    assert main(["rollout", "goop", "--data", "gop"]) == 1
+    assert "nor an embedded dataset of that name: dambreak2d, goop" in capsys.readouterr().err
+
+
+def make_goop(path):
+    generate(load_preset("goop").with_frames(4), path, {"train": 0, "valid": 0, "test": 2}, 0, 1)
+    return path
 
 
 def test_another_runtime_gives_the_same_rollout_to_rounding(folder):

@@ -12,7 +12,9 @@ from tests.scenes import box, cloud, emulator_of
 def test_stop_hands_out_what_was_sound_and_names_the_incident():
     emulator, particles = emulator_of(box(), scale=1e-6), cloud(box(), speed=0.0)
     monitor, handed = Monitor(Policy.STOP, speed=0.05), []  # of falling: reached after about 13 frames
-    with pytest.raises(RolloutStoppedError, match=r"stopped: speed 0\.\d+ \(limit 0.05\) in scene 0 by frame 4"):
+    with pytest.raises(
+        RolloutStoppedError, match=r"stopped: speed 0\.\d+ cells per frame \(limit 0.05\) in scene 0 by frame 4"
+    ):
         handed.extend(stream(emulator, particles, 100, monitor))
     assert 1 < len(handed) < 25
     assert [incident.what for incident in monitor.incidents] == ["speed"]

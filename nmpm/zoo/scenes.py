@@ -1,0 +1,83 @@
+"""Scenes of the presets that models were trained on, as the simulator draws them, to start rollouts from."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from nmpm._support.numbers import check_whole
+from nmpm.data.format import Trajectory
+from nmpm.data.generate import preset_metadata
+from nmpm.data.loading.padded_batch import collate
+from nmpm.data.loading.recording import RecordingReader
+from nmpm.errors import DataError
+from nmpm.particles import Particles, Window
+from nmpm.scene import Reading, Scene
+from nmpm.sim import Preset, load_preset, preset_names
+from nmpm.sim.state import Progress
+from nmpm.zoo.states import StateBuilder
+
+if TYPE_CHECKING:
+    from nmpm.zoo.pretrained import Pretrained
+
+_SAME = 1e-3
+"""Relative difference up to which lengths, times and volumes are the same."""
+
+
+def training_preset(model: Pretrained) -> Preset | None:
+    """The shipped preset whose scenes a model was trained on; None for recorded data, other simulators and scenes."""
+    if model.preset not in preset_names():
+        return None
+    preset = load_preset(str(model.preset))
+    return preset if _is_same(model.scene, preset.scene) else None
+
+
+def _is_same(one: Scene, other: Scene) -> bool:
+    facts = [(scene.materials, scene.boundary, scene.dim, scene.gravity_varies) for scene in (one, other)]
+    return (
+        facts[0] == facts[1]
+        and np.allclose(one.bounds, other.bounds, rtol=_SAME, atol=_SAME)
+        and math.isclose(one.dt, other.dt, rel_tol=_SAME)
+        and math.isclose(one.particle_volume, other.particle_volume, rel_tol=_SAME)
+    )
+
+
+def simulate_scene(
+    preset: Preset, seed: int, frames: int, gravity: tuple[float, ...] | None = None, progress: Progress | None = None
+) -> Trajectory:
+    """The scene that a preset draws for a seed, simulated for so many frames; gravity (D,) replaces the drawn one.
+
+    Raises:
+        ConfigError: if no initial state fits into the box.
+        UnstableError: if the simulation becomes unstable.
+    """
+    start = preset.draw(check_whole("seed", seed, 0))
+    start = start if gravity is None else dataclasses.replace(start, gravity=gravity)
+    made = preset.simulate_from(start, frames, progress)
+    return Trajectory(made.position, made.particle_type, made.attributes, metadata=preset_metadata(preset))
+
+
+def scene_window(model: Pretrained, trajectory: Trajectory) -> Window:
+    """A simulated scene as tests read it: its first two frames to start from, and the others as the truth."""
+    if trajectory.metadata is None:
+        raise DataError("The trajectory lacks its metadata, which name the types of its particles.")
+    reading = Reading(model.scene)
+    reader = RecordingReader(trajectory.metadata, reading)
+    return collate([reader.recording(trajectory, "the simulated scene")], reading)
+
+
+def drawn_state(model: Pretrained, preset: Preset, seed: int, gravity: Any) -> Particles:
+    """The state of the scene that a preset draws for a seed, one simulated frame later, where rollouts of tests start.
+
+    Raises:
+        DataError: if gravity is not the model's.
+    """
+    pull = None
+    if gravity is not None:
+        stated = StateBuilder(model.emulator, np.zeros((1, model.scene.dim)), torch.float64).gravity(gravity)
+        pull = tuple((stated[0] / model.scene.dt**2).tolist()) if model.scene.gravity_varies else None
+    return scene_window(model, simulate_scene(preset, seed, 1, pull)).initial
