@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import operator
+import sys
 from typing import Any, TypeGuard
 
 from nmpm._support.messages import one_line
@@ -16,8 +16,8 @@ def is_number(value: object) -> TypeGuard[int | float]:
 
 
 def is_finite(value: object) -> TypeGuard[int | float]:
-    """Whether a value is a number, no truth value, and finite."""
-    return is_number(value) and math.isfinite(value)
+    """Whether a value is a number, no truth value, and finite in float64."""
+    return is_number(value) and -sys.float_info.max <= value <= sys.float_info.max
 
 
 def check_whole(name: str, value: Any, least: int) -> int:

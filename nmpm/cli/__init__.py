@@ -29,6 +29,7 @@ COMMANDS = {
     "trade": ("nmpm.cli.trade", "Measure time and errors of models, the simulator and trivial predictors."),
     "export": ("nmpm.cli.export", "Write a model as a file that runs without nmpm: ONNX, or AOTInductor's."),
     "render": ("nmpm.cli.render", "Draw trajectories as PNG and GIF or MP4."),
+    "play": ("nmpm.cli.play", "Throw and pour in a browser, while a pretrained model predicts."),
     "view": ("nmpm.cli.view", "Write a page that plays trajectories in a browser."),
     "doctor": ("nmpm.cli.doctor", "Report on the installation and test it, for help with problems."),
 }
@@ -51,6 +52,7 @@ first steps:
   nmpm rollout goop --frames 400 --out out.h5  roll a pretrained model out
   nmpm render out.h5                           draw the rollout
   nmpm view out.h5                             play it in a browser
+  nmpm play waterramps                         throw, pour and drag, live in a browser
   nmpm stress goop                             test it at the extremes
   nmpm compare waterramps --data waterdrop-xl  does a model hold for other scenes than its own?
   nmpm trade goop                              what accuracy costs in time: model or simulator?

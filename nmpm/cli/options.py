@@ -36,9 +36,12 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
         return textwrap.indent("\n\n".join(filled), indent) + "\n"
 
 
-def add_model_options(parser: argparse.ArgumentParser) -> None:
-    """Add the positional argument `model` and the option `--root`."""
-    parser.add_argument("model", help=MODEL)
+def add_model_options(parser: argparse.ArgumentParser, default: str | None = None) -> None:
+    """Add the positional argument `model`, which may be left out where there is a default, and the option `--root`."""
+    if default is None:
+        parser.add_argument("model", help=MODEL)
+    else:
+        parser.add_argument("model", nargs="?", default=default, help=f"{MODEL} (default: {default})")
     parser.add_argument("--root", type=Path, help="look the name up in this zoo's folder alone")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, ClassVar, Self
@@ -97,6 +97,15 @@ class Preset(abc.ABC):
                 an obstacle.
             UnstableError: if the simulation becomes unstable; the message names the frame.
         """
+
+    def stream_from(self, start: InitialState) -> Iterator[Array]:  # noqa: ARG002
+        """Yield the positions (N, D) of what moves, frame after frame without end; each is overwritten by the next.
+
+        Raises:
+            ConfigError: if this solver cannot be followed so.
+            DataError, UnstableError: as `simulate_from`.
+        """
+        raise ConfigError(f"The preset {self.name} simulates whole trajectories alone.")
 
     def obstacles_from(self, particles: Array) -> tuple[Obstacle, ...]:
         """The obstacles that particles (M, D) which do not move fill, as trajectories hold them; the box has its walls.

@@ -151,7 +151,7 @@ def simulate_on(
     Raises:
         UnstableError: if the simulation becomes unstable.
     """
-    start, order = _initial_state(scene, state, preset)
+    start, order = initial_state(scene, state, preset)
     try:
         made = preset.simulate_from(start, frames, progress).position[1:, : len(order)]
     except UnstableError as error:
@@ -161,7 +161,7 @@ def simulate_on(
     return simulated
 
 
-def _initial_state(scene: Scene, state: Particles, preset: Preset) -> tuple[InitialState, NDArray[np.int64]]:
+def initial_state(scene: Scene, state: Particles, preset: Preset) -> tuple[InitialState, NDArray[np.int64]]:
     """What the simulator starts from, and the state's particles in the simulator's order, by material."""
     real, names = state.mask[0].cpu().numpy(), preset.scene.materials
     kinds = np.array([names.index(name) for name in scene.materials])[state.material[0].cpu().numpy()[real]]

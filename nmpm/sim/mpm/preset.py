@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, Self
@@ -186,13 +187,8 @@ class MpmPreset(Preset):
         raise reason
 
     def simulate_from(self, start: InitialState, frames: int, progress: Progress | None = None) -> SimulatedTrajectory:
-        start.check_particles(self.reach)
+        particles, stepper = self._prepare(start)
         counts, ramps = start.counts_of(len(self.materials)), start.obstacles_of(SimulatedRamp)
-        gravity = self.gravity if start.gravity is None else start.gravity
-        groups = tuple(zip(self.materials, counts, strict=True))
-        particles = MpmParticles(start.position, start.velocity, groups, self.spacing**self.dim)
-        stepper = MpmStepper(self._grid(gravity, ramps), self.frame_dt / self.substeps)
-        stepper.enclose(particles)
 
         def advance(frame: int) -> Array:
             stepper.advance_frame(particles, self.substeps, frame)
@@ -206,8 +202,25 @@ class MpmPreset(Preset):
         if ramps:
             attributes["pushed_out"] = stepper.pushed_out
         if self.gravity_turn:
-            attributes["gravity"] = np.array(gravity)
+            attributes["gravity"] = stepper.grid.gravity
         return SimulatedTrajectory(position, particle_type, attributes)
+
+    def stream_from(self, start: InitialState) -> Iterator[Array]:
+        particles, stepper = self._prepare(start)
+        for frame in itertools.count(1):
+            stepper.advance_frame(particles, self.substeps, frame)
+            yield particles.position
+
+    def _prepare(self, start: InitialState) -> tuple[MpmParticles, MpmStepper]:
+        """The particles of a state, and what advances them."""
+        start.check_particles(self.reach)
+        counts, ramps = start.counts_of(len(self.materials)), start.obstacles_of(SimulatedRamp)
+        gravity = self.gravity if start.gravity is None else start.gravity
+        groups = tuple(zip(self.materials, counts, strict=True))
+        particles = MpmParticles(start.position, start.velocity, groups, self.spacing**self.dim)
+        stepper = MpmStepper(self._grid(gravity, ramps), self.frame_dt / self.substeps)
+        stepper.enclose(particles)
+        return particles, stepper
 
     def obstacles_from(self, particles: Array) -> tuple[Obstacle, ...]:
         if self.ramps is None or self.dim != 2:

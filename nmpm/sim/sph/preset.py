@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -124,15 +126,8 @@ class SphPreset(Preset):
         return InitialState(position, velocity, gravity, (len(position),), obstacles)
 
     def simulate_from(self, start: InitialState, frames: int, progress: Progress | None = None) -> SimulatedTrajectory:
-        obstacles = start.obstacles_of(PolygonObstacle)
-        start.check_particles(self.box, obstacles)
-        start.counts_of(1)
-        gravity = np.array(self.gravity if start.gravity is None else start.gravity)
-        boundary = SolidBoundary(self.box, obstacles, self.spacing)
-        particles = SphParticles(start.position, start.velocity, self.fluid.density)
-        stepper = SphStepper(self.fluid, boundary, self.spacing, gravity, self.frame_dt / self.substeps)
-        stepper.initialise(particles)
-        deviations = [0.0]
+        particles, stepper = self._prepare(start)
+        boundary, deviations = stepper.boundary, [0.0]
 
         def advance(frame: int) -> Array:
             deviations.append(stepper.advance_frame(particles, self.substeps, frame))
@@ -141,8 +136,28 @@ class SphPreset(Preset):
         walls = boundary.position[boundary.visible]
         position = record_frames(particles.position, walls, frames, advance, progress)
         particle_type = np.repeat([WATER, BOUNDARY], [len(start.position), len(walls)]).astype(np.int64)
-        attributes = {"gravity": gravity, "held_back": stepper.held_back, "density_deviation": max(deviations)}
+        attributes = {
+            "gravity": stepper.gravity, "held_back": stepper.held_back, "density_deviation": max(deviations)
+        }  # fmt: skip
         return SimulatedTrajectory(position, particle_type, attributes)
+
+    def stream_from(self, start: InitialState) -> Iterator[Array]:
+        particles, stepper = self._prepare(start)
+        for frame in itertools.count(1):
+            stepper.advance_frame(particles, self.substeps, frame)
+            yield particles.position
+
+    def _prepare(self, start: InitialState) -> tuple[SphParticles, SphStepper]:
+        """The particles of a state, and what advances them."""
+        obstacles = start.obstacles_of(PolygonObstacle)
+        start.check_particles(self.box, obstacles)
+        start.counts_of(1)
+        gravity = np.array(self.gravity if start.gravity is None else start.gravity)
+        boundary = SolidBoundary(self.box, obstacles, self.spacing)
+        particles = SphParticles(start.position, start.velocity, self.fluid.density)
+        stepper = SphStepper(self.fluid, boundary, self.spacing, gravity, self.frame_dt / self.substeps)
+        stepper.initialise(particles)
+        return particles, stepper
 
     @property
     def type_names(self) -> dict[int, str]:

@@ -112,7 +112,6 @@ def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
     first, *others = positions.values()
     colours = material_colours(trajectories.materials)
     rgb = vary_brightness(np.array([colours[name] for name in trajectories.material.tolist()], dtype=np.uint8))
-    scale = np.round(255 * matplotlib.colormaps[COLOUR_SCALE](np.linspace(0, 1, 64))).astype(int).tolist()
     sampled = np.unique(np.linspace(0, len(first) - 1, SAMPLED_FRAMES).astype(int))
     moved = [path[sampled[1:]] - path[sampled[1:] - 1] for path in positions.values()]
     return {
@@ -127,13 +126,19 @@ def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
         "tilt": trajectories.tilt,
         "materials": [{"name": name, "colour": hex_code(colour)} for name, colour in colours.items()],
         "colours": pack_bytes(rgb),
-        "scale": [hex_code((red, green, blue)) for red, green, blue, _ in scale],
+        "scale": colour_scale(),
         "fastest": _nearly_largest(trajectories, moved),
         "worst": _nearly_largest(trajectories, [other[sampled] - first[sampled] for other in others]),
         **_describe_motion(trajectories, positions, every),
         "fields": [_describe_field(trajectories, name, every) for name in trajectories.fields],
         "curves": _describe_curves(trajectories, every),
     }
+
+
+def colour_scale() -> list[str]:
+    """The scale's colours, as #rrggbb."""
+    scale = np.round(255 * matplotlib.colormaps[COLOUR_SCALE](np.linspace(0, 1, 64))).astype(int).tolist()
+    return [hex_code((red, green, blue)) for red, green, blue, _ in scale]
 
 
 def _describe_motion(trajectories: LabelledTrajectories, positions: dict[str, Floats], every: int) -> dict[str, Any]:

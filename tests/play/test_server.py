@@ -1,0 +1,153 @@
+"""The server's doors, and the page in headless Chromium."""
+
+import asyncio
+import http.client
+import json
+import threading
+
+import pytest
+
+pytest.importorskip("websockets", reason="websockets is not installed")
+from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
+from websockets.sync.client import connect  # noqa: E402
+
+from nmpm.play.server import HOST, PlayServer, play  # noqa: E402
+from nmpm.play.session import Session  # noqa: E402
+from tests.conftest import wait_until  # noqa: E402
+from tests.play.conftest import model_of  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    """A server that plays, in a thread."""
+    session = Session(model_of("waterramps"), 1, tmp_path_factory.mktemp("played") / "played.h5")
+    server, ready = PlayServer(session), threading.Event()
+    loop = asyncio.new_event_loop()
+    task = loop.create_task(play(server, lambda address: ready.set()))
+
+    def run():
+        with pytest.raises(asyncio.CancelledError):
+            loop.run_until_complete(task)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    assert ready.wait(30)
+    yield server
+    loop.call_soon_threadsafe(task.cancel)
+    thread.join(30)
+    session.close()
+
+
+def get(server, path, host=None):
+    connection = http.client.HTTPConnection(HOST, server.port, timeout=30)
+    connection.request("GET", path, headers={"Host": host or f"{HOST}:{server.port}"})
+    answer = connection.getresponse()
+    return answer.status, answer.read().decode(), answer.headers
+
+
+def socket(server, token=None, origin=None):
+    address = f"ws://{HOST}:{server.port}/{token or server.token}/socket"
+    return connect(address, origin=origin or f"http://{HOST}:{server.port}", max_size=2**22, open_timeout=30)
+
+
+def read_all(page):
+    while True:
+        page.recv(timeout=30)
+
+
+def test_the_page_needs_the_token_and_the_name_of_this_machine(server):
+    status, text, headers = get(server, f"/{server.token}/")
+    assert status == 200
+    assert "nmpm play" in text
+    assert "default-src 'none'" in headers["Content-Security-Policy"]
+    for path in ("/", "/x/", f"/{server.token}", f"/{server.token}x/", "/%c3%a9/"):
+        assert get(server, path)[0] == 404
+    assert get(server, f"/{server.token}/", host="evil.example")[0] == 403
+
+
+def test_the_socket_needs_the_token_and_the_page(server):
+    for changes in ({"token": "wrong"}, {"origin": "http://evil.example"}):
+        with pytest.raises(InvalidStatus):
+            socket(server, **changes)
+    with socket(server) as page:
+        assert "scene" in json.loads(page.recv(timeout=30))
+
+
+def test_only_this_machine_is_served(server):
+    assert {address[0] for address in server.listening_at} == {"127.0.0.1"}
+
+
+def test_long_messages_and_floods_end_nothing(server):
+    with socket(server) as page:
+        page.send("x" * 100_000)
+        with pytest.raises(ConnectionClosed):
+            read_all(page)
+    with socket(server) as page:
+        for _ in range(300):
+            page.send("{}")
+        assert any("has no" in text for text in iter(lambda: page.recv(timeout=30), None) if isinstance(text, str))
+
+
+def test_another_page_takes_over(server):
+    with socket(server) as first, socket(server) as second:
+        with pytest.raises(ConnectionClosed) as closed:
+            read_all(first)
+        assert "another window" in str(closed.value)
+        assert "scene" in json.loads(second.recv(timeout=30))
+
+
+@pytest.fixture
+def page(browser, server):
+    """The page, open; fails at the end if it logged an error."""
+    context = browser.new_context(viewport={"width": 500, "height": 500})
+    errors, page = [], context.new_page()
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    page.goto(server.address)
+    wait_until(page, "window.play && play.stage && play.stage.drawn > 2")
+    yield page
+    context.close()
+    assert not errors
+
+
+def at(page, point):
+    """Pixels of the window at a point of the scene."""
+    x, y = page.evaluate(f"play.stage.pixelOf({json.dumps(point)})")
+    box = page.locator("#scene").bounding_box()
+    return box["x"] + x, box["y"] + y
+
+
+def drag(page, start, end):
+    page.mouse.move(*at(page, start))
+    page.mouse.down()
+    page.mouse.move(*at(page, end), steps=4)
+    page.mouse.up()
+
+
+def test_start_throw_drag_pour_close(page, server):
+    page.click("#restart")
+    page.evaluate("play.send({do: 'play', on: false})")
+    wait_until(page, "play.stage.films[0].frame < 5")
+    count = page.evaluate("play.stage.films[0].count")
+    drag(page, [0.15, 0.85], [0.2, 0.85])
+    wait_until(page, f"play.stage.films[0].count > {count}")
+    body = page.evaluate("play.stage.bodies[0]")
+    goal = [0.5, 0.6]
+    drag(page, body["centre"], goal)
+    wait_until(page, f"Math.abs(play.stage.bodies[0].centre[1] - {goal[1]}) < 0.02")
+    page.keyboard.press("p")
+    page.keyboard.press(" ")
+    count = page.evaluate("play.stage.films[0].count")
+    page.mouse.move(*at(page, [0.85, 0.85]))
+    page.mouse.down()
+    wait_until(page, f"play.stage.films[0].count > {count}")
+    page.mouse.up()
+    wait_until(page, "document.getElementById('rate').textContent.includes('pictures/s')")
+    page.close()
+    assert get(server, f"/{server.token}/")[0] == 200  # another page may be opened
+
+
+def test_the_page_says_what_was_wrong(page):
+    page.evaluate("play.send({do: 'restart', seed: -1})")
+    wait_until(page, "!document.getElementById('say').hidden")
+    assert "seed = -1" in page.locator("#say").inner_text()

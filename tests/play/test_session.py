@@ -1,0 +1,267 @@
+"""What a player does, and what the page is sent for it."""
+
+import json
+import random
+
+import numpy as np
+import pytest
+import torch
+
+from nmpm.data.convert import native_file
+from nmpm.data.format import Split
+from nmpm.play import session as sessions
+from nmpm.viz.viewer import page_of_files
+
+
+def room(player):
+    """The point in the upper half of the box that is farthest from particles, bodies and walls."""
+    points = np.stack(np.meshgrid(np.linspace(0.16, 0.84, 30), np.linspace(0.5, 0.84, 15)), axis=-1).reshape(-1, 2)
+    apart = [np.linalg.norm(points[:, None] - player.position, axis=-1).min(1)]
+    apart += [body.distance(torch.from_numpy(points)).numpy() for body in player.session.world.bodies.values()]
+    return points[np.min(apart, axis=0).argmax()].tolist()
+
+
+def throw(player, **changes):
+    values = {"material": 0, "at": room(player), "sides": [0.06, 0.06], "velocity": [0.0, 0.0]}
+    return player.do("throw", **(values | changes))
+
+
+def test_a_thrown_block_appears_in_the_next_picture_and_flies(play):
+    player = play()
+    before, at = len(player.position), room(player)
+    velocity = np.where(np.array(at) < 0.5, 1.0, -1.0)  # into the box
+    assert throw(player, velocity=velocity.tolist()) is None
+    thrown = player.position[before:]
+    assert len(thrown) == 36  # 0.06 / 0.0107 are six particles
+    dt = player.session.scene.dt
+    expected = np.array(at) + dt * velocity
+    assert thrown.mean(0) == pytest.approx(expected, abs=2e-3)
+    player.tick(10)
+    time = 11 * dt
+    expected = np.array(at) + time * velocity + [0.0, -9.81 * time**2 / 2]
+    assert player.position[before:].mean(0) == pytest.approx(expected, abs=0.02)
+
+
+def test_blocks_take_no_room_of_others_and_no_more_than_there_is(play, monkeypatch):
+    player = play("goop")
+    inside = player.position[0].tolist()
+    assert throw(player, at=inside, sides=[0.01, 0.01]) == "there is no room for a block here"
+    assert "at most" in throw(player, sides=[0.8, 0.9])
+    assert "beyond" in throw(player, velocity=[100.0, 0.0])
+    assert "2 axes" in throw(player, at=[0.5, 0.5, 0.5])
+    assert "there are 1, goop" in throw(player, material=1)
+    player.session.most_particles = player.session.world.count + 10
+    assert "at most" in throw(player)
+    assert len(player.position) == player.session.world.count
+
+
+def test_pouring_goes_on_until_it_is_stopped(play):
+    player = play("goop")
+    before = player.session.world.count
+    assert player.do("pour", material=0, at=[0.2, 0.85], velocity=[0.0, -1.0], width=0.03) is None
+    player.tick(30)
+    poured = player.session.world.count - before
+    assert poured > 20
+    player.do("stop")
+    now = player.session.world.count
+    player.tick(10)
+    assert player.session.world.count == now
+    assert player.do("pour", material=0, at=[0.2, 0.85], velocity=[0.0, 0.0], width=0.03) == (
+        "what is poured needs a velocity"
+    )
+
+
+def test_a_dragged_ramp_pushes_particles_out_of_its_way(play):
+    player = play()
+    ramp = player.texts["bodies"][0]
+    target = player.position.mean(0).tolist()
+    assert player.do("move", body=ramp["id"], centre=target, angle=0.5) is None
+    body = player.session.world.bodies[ramp["id"]]
+    player.tick(2)
+    inside = body.distance(player.session.world.position.double())
+    assert (inside > -0.5 * player.session.scene.particle_spacing).all()
+    assert player.texts["bodies"][0]["centre"] == pytest.approx(target)
+    assert "there is no body 77" in player.do("move", body=77, centre=target, angle=0.0)
+    assert "no part of it is within the domain" in player.do("move", body=ramp["id"], centre=[9.0, 9.0], angle=0.0)
+    assert player.texts["bodies"][0]["centre"] == pytest.approx(target)
+
+
+def test_bodies_are_put_and_taken_away_where_the_model_has_obstacles(play):
+    player = play()
+    count = len(player.texts["bodies"])
+    assert player.do("put", kind="disc", centre=[0.3, 0.8]) is None
+    assert player.texts["bodies"][-1]["kind"] == "disc"
+    assert player.do("remove", body=player.texts["bodies"][-1]["id"]) is None
+    assert len(player.texts["bodies"]) == count
+    for _ in range(sessions.MOST_BODIES - count):
+        player.do("put", kind="ramp", centre=[0.5, 0.8])
+    assert "already" in player.do("put", kind="ramp", centre=[0.5, 0.8])
+    assert "without obstacles" in play("goop").do("put", kind="disc", centre=[0.3, 0.8])
+
+
+def test_gravity_turns_where_it_is_an_input(play):
+    player = play("variablegravity")
+    pull = np.hypot(*player.texts["gravity"])
+    assert player.do("gravity", vector=[pull, 0.0]) is None
+    start = player.position.mean(0)
+    player.tick(20)
+    assert player.position.mean(0)[0] > start[0] + 0.005
+    assert "outside of the range" in player.do("gravity", vector=[1e4, 0.0])
+    assert "knows only" in play("goop").do("gravity", vector=[9.81, 0.0])
+
+
+def test_pause_and_step(play):
+    player = play("goop")
+    player.do("play", on=False)
+    frame = player.session.frame
+    pictures = len(player.sent)
+    player.tick(5)
+    assert (player.session.frame, len(player.sent)) == (frame, pictures)
+    player.do("step")
+    assert player.session.frame == frame + 1
+    player.do("pace", frames=4)
+    player.do("play", on=True)
+    assert player.session.frame == frame + 5
+
+
+def test_a_restart_gives_the_same_again(play):
+    player = play()
+    first = player.session.world.position.clone()
+    throw(player)
+    player.tick(20)
+    once = player.session.world.position.clone()
+    player.do("play", on=False)
+    player.do("restart", seed=1)
+    assert (player.session.world.position == first).all()
+    player.do("play", on=True)
+    player.do("restart", seed=1)
+    player.session.restart(1)
+    throw(player)
+    player.tick(20)
+    assert (player.session.world.position[: len(first)] == once[: len(first)]).all()
+    player.do("restart", seed=2)
+    assert len(player.session.world.position) != len(first)
+    assert "must be" in player.do("restart", seed=-1)
+
+
+def test_what_was_played_is_a_trajectory_that_the_viewer_opens(play):
+    player = play()
+    assert "nothing was played yet" in play().do("save")
+    count = player.session.world.count
+    player.tick(4)
+    throw(player)
+    player.do("put", kind="disc", centre=[0.3, 0.8])
+    player.do("move", body=player.texts["bodies"][0]["id"], centre=[0.5, 0.5], angle=0.3)
+    player.tick(4)
+    assert "nmpm view" in player.do("save")
+    path = player.session.out
+    played = Split(native_file(path)).read(0)
+    moving = played.particle_type == 5
+    assert moving.sum() == count + 36
+    absent = np.isnan(played.position[:, moving, 0]).sum(1)
+    assert absent[0] == 36
+    assert absent[-1] == 0
+    assert len(page_of_files((path, 0), None).html) > 5e4
+    player.do("save")
+    assert path.with_stem("played-2").exists()
+
+
+def test_a_slow_page_slows_the_session_down(play):
+    player = play("goop")
+    frame = player.session.frame
+    for _ in range(50):
+        player.session.tick()
+    assert player.session.frame <= frame + sessions.AHEAD
+
+
+def test_the_simulator_runs_beside_from_the_same_state(play):
+    player = play("goop")
+    player.tick(3)
+    start = player.session.world.position.numpy()
+    assert player.do("beside", on=True) is None
+    shown = []
+    for _ in range(600):
+        player.tick()
+        player.session._beside._process.join(0.1)  # (waits a little)
+        shown = [m for m in player.sent if m[0] == 1]
+        if len(shown) > 3:
+            break
+    _, frame, data, count = shown[0]
+    assert (frame >= 1, count) == (True, len(start))
+    steps = np.frombuffer(data, "<u2").reshape(-1, 2)
+    scene = player.texts["scene"]
+    position = scene["low"] + (np.array(scene["high"]) - scene["low"]) * steps / 65535
+    assert np.abs(position - start).max() < 0.05
+    ramps = play()
+    assert ramps.do("put", kind="disc", centre=[0.3, 0.8]) is None
+    assert ramps.do("beside", on=True) is not None  # the simulator has no discs
+    assert ramps.session._beside is None
+
+
+VALID = [
+    {"do": "throw", "material": 0, "at": [0.5, 0.5], "sides": [0.05, 0.05], "velocity": [0.0, 0.0]},
+    {"do": "pour", "material": 0, "at": [0.5, 0.8], "velocity": [0.0, -1.0], "width": 0.05},
+    {"do": "stop"},
+    {"do": "move", "body": 0, "centre": [0.5, 0.5], "angle": 0.1},
+    {"do": "put", "kind": "ramp", "centre": [0.5, 0.5]},
+    {"do": "remove", "body": 1},
+    {"do": "gravity", "vector": [0.0, -9.81]},
+    {"do": "play", "on": True},
+    {"do": "step"},
+    {"do": "pace", "frames": 2},
+    {"do": "seen", "picture": 0},
+]
+ODD = [
+    None,
+    True,
+    -1,
+    0,
+    1e308,
+    -1e308,
+    10**400,
+    float("nan"),
+    float("inf"),
+    "",
+    "x" * 300,
+    [],
+    {},
+    [[]],
+    [1e9] * 2,
+    [0.5],
+]
+
+
+def malformed(rng):
+    """Random bytes, or a valid message with a key, a value or some characters changed."""
+    kind = rng.randrange(4)
+    if kind == 0:
+        return bytes(rng.randrange(256) for _ in range(rng.randrange(60)))
+    message = dict(rng.choice(VALID))
+    if kind == 1:
+        text = list(json.dumps(message))
+        for _ in range(rng.randrange(1, 4)):
+            text[rng.randrange(len(text))] = chr(rng.randrange(1, 0x3000))
+        return "".join(text)
+    keys = list(message)
+    if kind == 2:
+        message[rng.choice([*keys, "other"])] = rng.choice(ODD)
+    else:
+        message.pop(rng.choice(keys))
+    return json.dumps(message)
+
+
+def test_a_thousand_malformed_messages_leave_the_session_running(play):
+    player, rng = play(), random.Random(0)
+    player.session.most_particles = player.session.world.count + 300
+    for text in ["[" * 999, "", "null", "{}", '{"do": ["throw"]}', "x" * 10_000, b"\xff" * 900]:
+        player.session.receive(text)
+    for number in range(1000):
+        player.session.receive(malformed(rng))
+        if number % 25 == 0:
+            player.tick()
+    player.do("stop")
+    player.do("play", on=True)
+    frame = player.session.frame
+    player.tick(3)
+    assert player.session.frame > frame
+    assert np.isfinite(player.position).all()
