@@ -8,13 +8,13 @@ import threading
 import pytest
 
 pytest.importorskip("websockets", reason="websockets is not installed")
-from websockets.exceptions import ConnectionClosed, InvalidStatus  # noqa: E402
-from websockets.sync.client import connect  # noqa: E402
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
 
-from nmpm.play.server import HOST, PlayServer, play  # noqa: E402
-from nmpm.play.session import Session  # noqa: E402
-from tests.conftest import wait_until  # noqa: E402
-from tests.play.conftest import model_of  # noqa: E402
+from nmpm.play.server import HOST, PlayServer, play
+from nmpm.play.session import Session
+from tests.conftest import wait_until
+from tests.play.conftest import model_of
 
 
 @pytest.fixture(scope="module")
