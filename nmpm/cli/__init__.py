@@ -23,6 +23,7 @@ COMMANDS = {
     "init": ("nmpm.cli.init", "Write a configuration for a dataset, chosen by what its trajectories show."),
     "inspect": ("nmpm.cli.inspect", "Summarise a dataset on one screen, with anything odd about it."),
     "zoo": ("nmpm.cli.zoo", "List the pretrained models, find one for your data, or add a finished run."),
+    "demo": ("nmpm.cli.demo", "Show a model beside the simulator that it learned from: times, error, a page."),
     "rollout": ("nmpm.cli.rollout", "Roll a pretrained model out and write the trajectories."),
     "stress": ("nmpm.cli.stress", "Test a model at the extremes: pass or fail, with measured margins."),
     "compare": ("nmpm.cli.compare", "Compare models on scenes that need not be their own."),
@@ -43,6 +44,7 @@ commands:
 {commands}
 
 first steps:
+  nmpm demo                                    a simulator and its emulator, side by side in a browser
   nmpm fit --config goop.yaml                  simulate the goop dataset, train on it, test, draw
   nmpm fit --resume runs/goop                  go on after an interruption
   nmpm inspect FOLDER                          summarise recorded data of any format known

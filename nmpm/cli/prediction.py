@@ -31,17 +31,32 @@ def predict(
     prescribed: Prescribed | None = None,
     between: int = 1,
 ) -> Rollout:
-    """Predict so many frames and print what was watched and the time of a frame.
+    """Predict so many frames and print what was watched and the time of a frame; see `timed_rollout`."""
+    monitor = Monitor(Policy(watch))
+    rollout, taken = timed_rollout(model, state, frames, monitor, prescribed, between)
+    sys.stdout.write(f"{monitor.report()}\n{taken:.3g} ms per frame on {device_name(model.emulator.device)}.\n")
+    return rollout
+
+
+def timed_rollout(
+    model: Pretrained,
+    state: Particles,
+    frames: int,
+    monitor: Monitor,
+    prescribed: Prescribed | None = None,
+    between: int = 1,
+) -> tuple[Rollout, float]:
+    """Predict so many frames, with a progress bar; with the milliseconds per frame.
 
     Args:
         model: The model.
         state: That it starts from.
         frames: How many.
-        watch: What happens where a limit is exceeded: "warn", "stop" or "record".
+        monitor: Watches it.
         prescribed: What moves or enters as recorded.
         between: Frames that the model makes for each of these; all but every last of them are left out.
     """
-    monitor, parts, steps = Monitor(Policy(watch)), [], frames * between
+    parts, steps = [], frames * between
     start, given = state.to(model.emulator.device), prescribed and prescribed.to(model.emulator.device)
     warn_of_start_outside(model.emulator, start)
     times = [time.perf_counter()]
@@ -50,9 +65,7 @@ def predict(
             times.append(time.perf_counter())
             parts.append(part)
             step()
-    taken = milliseconds(times, model.emulator.frames / between)
-    sys.stdout.write(f"{monitor.report()}\n{taken:.3g} ms per frame on {device_name(model.emulator.device)}.\n")
-    return Rollout.join(parts)
+    return Rollout.join(parts), milliseconds(times, model.emulator.frames / between)
 
 
 def milliseconds(times: Sequence[float], frames: float) -> float:
