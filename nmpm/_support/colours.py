@@ -9,9 +9,6 @@ import zlib
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
-import numpy as np
-from numpy.typing import NDArray
-
 Rgb = tuple[int, int, int]
 
 BACKGROUND: Rgb = (255, 255, 255)
@@ -39,12 +36,12 @@ MATERIAL_COLOURS: Mapping[str, Rgb] = MappingProxyType(
 )
 
 FALLBACK_COLOURS: tuple[Rgb, ...] = (
-    (213, 94, 0),
-    (111, 84, 190),
-    (128, 150, 40),
-    (0, 130, 140),
-    (222, 120, 150),
-    (150, 20, 40),
+    (210, 112, 83),
+    (14, 83, 0),
+    (197, 138, 255),
+    (147, 198, 88),
+    (128, 110, 24),
+    (79, 45, 153),
 )
 """For materials not in MATERIAL_COLOURS."""
 
@@ -61,22 +58,6 @@ def material_colours(names: Iterable[str]) -> dict[str, Rgb]:
         candidates = FALLBACK_COLOURS[start:] + FALLBACK_COLOURS[:start]
         colours[name] = next((free for free in candidates if free not in colours.values()), candidates[0])
     return {name: colours[name] for name in ordered}
-
-
-def vary_brightness(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Makes some particles slightly lighter or darker, to show how a material flows.
-
-    Args:
-        colours: (N, 3), one per particle.
-
-    Returns:
-        (N, 3); the change depends on the particle's index only, and is zero for the first.
-    """
-    changes = np.array([0.0, 0.16, -0.14, 0.07, -0.07])
-    change = changes[(np.arange(len(colours), dtype=np.uint64) * 2654435761 >> 13) % len(changes)][:, None]
-    base = colours.astype(np.float64)
-    mixed = np.where(change > 0, base + (255 - base) * change, base * (1 + change))
-    return np.asarray(np.round(mixed), dtype=np.uint8)
 
 
 def hex_code(colour: Rgb) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm._support.colours import hex_code, material_colours, vary_brightness
+from nmpm._support.colours import hex_code, material_colours
 from nmpm.obstacles import Body
 from nmpm.scene import Scene
 from nmpm.viz.viewer.page import ABSENT, STEPS, colour_scale, quantize
@@ -32,9 +32,9 @@ def picture(scene: Scene, kind: int, number: int, frame: int, position: NDArray[
 
 
 def colours(scene: Scene, material: NDArray[Any]) -> bytes:
-    """The colours of particles (N,), some a little lighter or darker."""
+    """The colours of particles (N,)."""
     palette = np.array(list(material_colours(scene.materials).values()), dtype=np.uint8)
-    rgb = vary_brightness(palette[material])
+    rgb = palette[material]
     return struct.pack("<4I", COLOURS, 0, 0, len(material)) + rgb.tobytes()
 
 

@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from nmpm._support.colours import BACKGROUND, EDGE, INTERIOR, OBSTACLE, TEXT, WALL, material_colours, vary_brightness
+from nmpm._support.colours import BACKGROUND, EDGE, INTERIOR, OBSTACLE, TEXT, WALL, material_colours
 from nmpm.viz.camera import Camera, box_corners, fit_camera, vertical_axis
 from nmpm.viz.occupancy import CELL, LEVELS, band_colours, occupied_share
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
 SUPERSAMPLING = 3
 """Canvas points per pixel along each axis."""
-DISC_DIAMETER = 1.2
-"""Diameter of a disc in particle spacings; discs overlap a little, so that a body looks continuous."""
+DISC_DIAMETER = 1.5
+"""Diameter of a disc in particle spacings: above √2, from which on the discs of a square lattice leave no gaps."""
 DIAMETER_LIMITS = (2.2, 24.0)
 """Smallest and largest diameter of a disc in pixels."""
 DEPTH_FADE = 0.55
@@ -62,7 +62,7 @@ class PanelRenderer:
         materials = np.array([colours[name] for name in trajectories.material.tolist()], dtype=np.uint8)
         # Obstacles come first, so that material is drawn over them in 2-D.
         obstacles = np.tile(np.array(OBSTACLE, dtype=np.uint8), (len(trajectories.obstacles), 1))
-        self._colours = np.concatenate([obstacles, vary_brightness(materials)])
+        self._colours = np.concatenate([obstacles, materials])
 
     def draw(self, position: Floats, ensemble: Sequence[Floats] = ()) -> NDArray[np.uint8]:
         """Draws one frame.

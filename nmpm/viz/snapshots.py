@@ -35,7 +35,7 @@ LEGENDS, LEGEND_WIDTH = 64, 640  # height of an ensemble's legends, and width of
 
 
 def write_snapshots(trajectories: LabelledTrajectories, path: Path | str, columns: int = 6) -> Path:
-    """Writes a picture of a few frames, evenly spaced from the first to the last.
+    """Writes a picture of a few frames from the first to the last, between which particles move equally far.
 
     The rows are in the order of the trajectories. With at least two of them, a chart below shows the root mean square
     position error of each later one against the first. A member of an ensemble is drawn over the share of members that
@@ -68,7 +68,7 @@ class _Snapshots:
 
     def __init__(self, trajectories: LabelledTrajectories, columns: int) -> None:
         self.trajectories = trajectories
-        self.frames = trajectories.evenly_spaced_frames(columns)
+        self.frames = trajectories.eventful_frames(columns)
         camera = fit_camera(trajectories)
         stretch = float(np.clip(math.sqrt(camera.width / camera.height), 0.6, 1.4))
         self.panel = PanelRenderer(trajectories, round(PANEL_SIDE * stretch))

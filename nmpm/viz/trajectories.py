@@ -17,6 +17,8 @@ STRAIGHT = math.radians(1)
 """Gravity within this angle of straight down needs no arrow."""
 MOST_OBLONG = 1000
 """Longest side of a box over the shortest; pictures grow with it."""
+REST_SHARE = 0.02
+"""Of the mean motion from frame to frame: added to that of each frame, so that scenes at rest show time that passes."""
 Floats = NDArray[np.floating[Any]]
 
 
@@ -162,6 +164,15 @@ class LabelledTrajectories:
         indices = np.linspace(0, self.frame_count - 1, min(count, self.frame_count))
         return [int(frame) for frame in np.round(indices)]
 
+    def eventful_frames(self, count: int) -> list[int]:
+        """Indices of at most `count` frames, from the first to the last, between which particles move equally far."""
+        first = next(iter(self.positions.values()))
+        moved = self.rms_distance(first[:-1], first[1:])
+        moved = moved + REST_SHARE * moved.mean() if moved.any() else np.ones(len(moved))
+        path = np.concatenate([[0.0], np.cumsum(moved)])
+        nearest = np.abs(path[:, None] - np.linspace(0, path[-1], count)).argmin(axis=0)
+        return sorted({*nearest.tolist(), 0, self.frame_count - 1} if count > 1 else {0})
+
     @property
     def predicted(self) -> NDArray[np.bool_]:
         """Whether each particle is predicted, (N,)."""
@@ -177,7 +188,7 @@ class LabelledTrajectories:
 
     def rms_distance(self, first: Floats, second: Floats) -> NDArray[np.float64]:
         """Root mean square distance (T,) of the predicted particles of two trajectories (T, N, D), as `rms_errors`."""
-        squares = np.zeros(self.frame_count)
+        squares = np.zeros(len(first))
         for axis, period in enumerate(self.periods):
             difference = second[:, self.predicted, axis].astype(np.float64) - first[:, self.predicted, axis]
             if period:

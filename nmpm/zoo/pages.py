@@ -6,6 +6,7 @@ import csv
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -262,7 +263,11 @@ def _draw_errors(axes: Axes, errors: Mapping[str, Sequence[float]], name: str) -
 
 def _draw_training(axes: Axes, training: Mapping[str, Sequence[float]]) -> None:
     values = [1e3 * value for value in training["mse"]]
-    axes.plot([seconds / 3600 for seconds in training["seconds"]], values, marker=".")
+    hours = [seconds / 3600 for seconds in training["seconds"]]
+    # Restarts with a high learning rate raise the error for a while; what counts is the best so far.
+    axes.plot(hours, values, ls="", marker=".", ms=3, color="0.7", label="each validation")
+    axes.step(hours, list(accumulate(values, min)), where="post", label="best so far")
+    axes.legend(frameon=False, fontsize="small")
     scale = "log" if max(values) > 10 * min(values) else "linear"
     axes.set(xlabel="hours of training", ylabel="validation MSE ×10⁻³", yscale=scale, title="full rollouts")
 

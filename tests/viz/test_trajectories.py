@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nmpm._support.colours import FALLBACK_COLOURS, INTERIOR, OBSTACLE, material_colours, vary_brightness
+from nmpm._support.colours import FALLBACK_COLOURS, INTERIOR, OBSTACLE, material_colours
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 from nmpm.viz import LabelledTrajectories, material_names
@@ -108,10 +108,10 @@ def lab(rgb, vision):
 
 @pytest.mark.parametrize("vision", VISION)
 def test_materials_are_distinguishable_from_each_other_and_from_the_background(vision):
-    names = ["water", "sand", "goop", "elastic", "rigid", "boundary"]
-    shown = material_colours(names) | {"background": INTERIOR}
+    names = ["water", "sand", "goop", "elastic", "snow", "rigid", "boundary"]
+    shown = [*material_colours(names).values(), *FALLBACK_COLOURS, INTERIOR]
     for one, other in itertools.combinations(shown, 2):
-        assert np.linalg.norm(lab(shown[one], vision) - lab(shown[other], vision)) > 15, (one, other)
+        assert np.linalg.norm(lab(one, vision) - lab(other, vision)) > 15, (one, other)
 
 
 def test_unknown_materials_have_different_colours_in_the_given_order_that_are_the_same_in_every_run():
@@ -122,9 +122,16 @@ def test_unknown_materials_have_different_colours_in_the_given_order_that_are_th
     assert material_colours(["debris", "boundary"]) == {"debris": FALLBACK_COLOURS[4], "boundary": OBSTACLE}
 
 
-def test_brightness_varies_a_little_around_the_colour():
-    plain = np.tile(np.array(material_colours(["water"])["water"], dtype=np.uint8), (200, 1))
-    varied = vary_brightness(plain)
-    assert tuple(varied[0]) == tuple(plain[0])
-    assert 1 < len(np.unique(varied, axis=0)) < 8
-    assert np.abs(varied.astype(int) - plain).max() < 45
+def test_eventful_frames_leave_out_those_at_rest(still):
+    """One particle crosses the box in frames 10 to 30 of 100."""
+    along = np.clip((np.arange(101) - 10) / 20, 0, 1)
+    moving = dataclasses.replace(
+        still([[0.5, 0.5]], ["water"]), positions={"truth": np.stack([along, along], axis=1)[:, None]}
+    )
+    frames = moving.eventful_frames(6)
+    assert (frames[0], frames[-1], len(frames)) == (0, 100, 6)
+    assert all(10 <= frame <= 32 for frame in frames[1:-1])
+    resting = dataclasses.replace(moving, positions={"truth": np.full((101, 1, 2), 0.5)})
+    assert resting.eventful_frames(6) == [0, 20, 40, 60, 80, 100]
+    assert resting.eventful_frames(1) == [0]
+    assert still([[0.5, 0.5]], ["water"]).eventful_frames(6) == [0]

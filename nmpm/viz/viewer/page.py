@@ -17,7 +17,7 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm._support.colours import hex_code, material_colours, vary_brightness
+from nmpm._support.colours import hex_code, material_colours
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import vertical_axis
 from nmpm.viz.occupancy import CELL, LEVELS, ensemble_colour
@@ -111,7 +111,7 @@ def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
     }
     first, *others = positions.values()
     colours = material_colours(trajectories.materials)
-    rgb = vary_brightness(np.array([colours[name] for name in trajectories.material.tolist()], dtype=np.uint8))
+    rgb = np.array([colours[name] for name in trajectories.material.tolist()], dtype=np.uint8)
     sampled = np.unique(np.linspace(0, len(first) - 1, SAMPLED_FRAMES).astype(int))
     moved = [path[sampled[1:]] - path[sampled[1:] - 1] for path in positions.values()]
     return {
