@@ -34,7 +34,7 @@ def picture(scene: Scene, kind: int, number: int, frame: int, position: NDArray[
 def colours(scene: Scene, material: NDArray[Any]) -> bytes:
     """The colours of particles (N,)."""
     palette = np.array(list(material_colours(scene.materials).values()), dtype=np.uint8)
-    rgb = palette[material]
+    rgb: NDArray[np.uint8] = palette[material]
     return struct.pack("<4I", COLOURS, 0, 0, len(material)) + rgb.tobytes()
 
 
