@@ -130,6 +130,8 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
     choices = trade.make_choices(sweep, scenes, models, device, predictors, **match._asdict())
     if not choices:
         raise ConfigError("There is nothing to measure: give --models, or settings of the simulator.")
+    for line in sweep.models.left_out(device) if models else []:
+        sys.stdout.write(f"{line}\n")
     points = trade.measure(choices, scenes, sweep, trade.Store(out), command)
     console = Console()
     shown = likely_points(points) if command == "trade" else points

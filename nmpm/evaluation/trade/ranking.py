@@ -208,12 +208,17 @@ def recommend(points: Sequence[Point]) -> list[Recommendation]:
 
 
 def beside_simulator(points: Sequence[Point]) -> str:
-    """The most accurate emulator beside the simulator's stable settings, in a sentence; empty without either."""
+    """An emulator beside the simulator's stable settings, in a sentence; empty without either.
+
+    The most accurate emulator; or a faster one whose error is within that one's interval.
+    """
     timed = [point for point in points if point.competes and math.isfinite(point.mean("mse"))]
     models = [point for point in timed if point.kind is Kind.MODEL and point.batch == 1]
     if not models or all(point.kind is not Kind.SIMULATOR for point in points):
         return ""
-    model = min(models, key=lambda model: model.mean("mse"))
+    best = min(models, key=lambda model: model.mean("mse"))
+    most = rank(points)[best.name].high
+    model = min((one for one in models if one.mean("mse") <= most), key=lambda one: one.milliseconds)
     time, error = model.milliseconds, model.mean("mse")
     simulators = [(point.milliseconds, point.mean("mse"), point) for point in timed if point.kind is Kind.SIMULATOR]
     as_fast = [(its_error / error, point.name) for its_time, its_error, point in simulators if its_time <= time]
@@ -225,4 +230,7 @@ def beside_simulator(points: Sequence[Point]) -> str:
     if as_good:
         share, name = min(as_good)
         good = f"{name} is no less accurate and takes {share:.2g} × its time"
-    return f"The most accurate emulator, {model.name}, beside the simulator: {fast}; {good}."
+    which = (
+        "The most accurate emulator" if model is best else "The fastest of the emulators that are as accurate as any"
+    )
+    return f"{which}, {model.name}, beside the simulator: {fast}; {good}."

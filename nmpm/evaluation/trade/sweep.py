@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib import resources
 from itertools import product
-from typing import Any, Literal
+from typing import Any
 
 import torch
 
@@ -33,6 +33,7 @@ from nmpm.evaluation.trade.choices import (
 )
 from nmpm.evaluation.trade.fitted import FittedModel, fit_to_scenes
 from nmpm.evaluation.trade.members import MembersChoice
+from nmpm.evaluation.trade.model_settings import ModelSettings
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.scene import Scene
 from nmpm.sim import Preset
@@ -53,25 +54,6 @@ class Timing:
 
     rounds: int = 9
     frames: int = 200
-
-
-@dataclass(frozen=True)
-class ModelSettings:
-    """Settings of every model; all combinations of them are measured.
-
-    Args:
-        precision: Precisions of the network.
-        constraints: "held", with the model's constraints, and "free", without them.
-        runtime: What computes the network, see `nmpm.emulator.runtimes.RUNTIMES`.
-        batch: Batch sizes, in scenes.
-        members: Rollouts of each scene by a model's first form, which stand beside it as an ensemble; 0 for none.
-    """
-
-    precision: tuple[Literal["float32", "bfloat16"], ...] = ("float32", "bfloat16")
-    constraints: tuple[Literal["held", "free"], ...] = ("held", "free")
-    runtime: tuple[str, ...] = ("eager",)
-    batch: tuple[int, ...] = (1, 8)
-    members: int = 0
 
 
 @dataclass(frozen=True)
@@ -247,11 +229,18 @@ def _model_choices(settings: ModelSettings, model: FittedModel, scenes: Scenes, 
     facts = {"model": model.name + OTHER_SCENES * bool(model.differing), "weights": model.weights}
     facts |= {"scenes_differ_in": model.differing} if model.differing else {}
     forms: dict[str, Choice] = {}
-    for variant in product(settings.precision, settings.constraints, settings.runtime):
+    precisions, runtimes = settings.precisions(device), settings.runtimes(device)
+    first = precisions[0], settings.constraints[0], runtimes[0]
+    for variant in product(precisions, settings.constraints, runtimes):
         precision, constraints, runtime = variant
         form = model.emulator.with_network(NETWORK_PRECISIONS[precision])
-        form = (form if constraints == "held" else form.unconstrained()).to(device).with_runtime(runtime)
-        first = settings.precision[0], settings.constraints[0], settings.runtime[0]
+        form = (form if constraints == "held" else form.unconstrained()).to(device)
+        try:
+            form = form.with_runtime(runtime)
+        except ConfigError:
+            if settings.runtime is not None:
+                raise
+            continue  # none that was asked for
         name = ", ".join([facts["model"], *(part for part, usual in zip(variant, first, strict=True) if part != usual)])
         varied = {"precision": precision, "constraints": constraints, "runtime": runtime}
         varied["cells"] = "×".join(map(str, form.grid.shape))
@@ -279,11 +268,11 @@ def _ensembles(
             f"--members: {model.name} was trained on scenes of another kind, and only its one rollout is matched to"
             " these: leave --members or this model out."
         )
-    form = model.emulator.with_network(NETWORK_PRECISIONS[settings.precision[0]])
+    form = model.emulator.with_network(NETWORK_PRECISIONS[settings.precisions(device)[0]])
     form = form if settings.constraints[0] == "held" else form.unconstrained()
     yield MembersChoice(
         name=f"{facts['model']}, {counted(settings.members, 'member')}",
-        emulator=form.to(device).with_runtime(settings.runtime[0]),
+        emulator=form.to(device).with_runtime(settings.runtimes(device)[0]),
         members=settings.members,
         settings=facts,
         device=device,

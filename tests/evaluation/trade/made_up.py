@@ -20,7 +20,7 @@ SWEEP = """
 scenes: 2
 measures: {horizons: [4], emd_frames: 1, emd_particles: 40}
 timing: {rounds: 2, frames: 4}
-models: {precision: [float32], batch: [1, 2]}
+models: {precision: [float32], runtime: [eager], batch: [1, 2]}
 simulator: {coarser: [1, 2], substeps: [1, 0.5]}
 """
 

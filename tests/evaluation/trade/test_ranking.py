@@ -75,3 +75,11 @@ def test_the_simulator_at_equal_time_and_at_equal_error():
     assert "simulator, 6 substeps is no slower and has 0.5 × its error" in slower
     assert beside_simulator([one for one in POINTS if one.kind is not Kind.SIMULATOR]) == ""
     assert beside_simulator([]) == ""
+
+
+def test_the_fastest_of_equally_accurate_emulators_stands_beside_the_simulator():
+    """A form that is more accurate by chance, and slower, let the simulator win."""
+    chance = point("ours, emulated", time=3.6, errors=(0.79, 1.19))
+    sentence = beside_simulator([*POINTS, chance])
+    assert "The fastest of the emulators that are as accurate as any, ours, beside the simulator" in sentence
+    assert "no stable simulator setting is as fast" in sentence

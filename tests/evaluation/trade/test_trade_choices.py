@@ -15,10 +15,12 @@ from nmpm.evaluation.trade import (
     find_factory,
     find_wider_scenes,
     make_choices,
+    model_settings,
     read_sweep,
     shipped_sweep_text,
 )
-from nmpm.evaluation.trade.choices import follow_nearest
+from nmpm.evaluation.trade.choices import CPU, follow_nearest
+from nmpm.evaluation.trade.model_settings import ModelSettings
 from nmpm.sim import load_preset
 from tests.evaluation.trade.made_up import tiny_emulator, tiny_sweep
 
@@ -125,6 +127,23 @@ def test_runtimes_are_choices_of_their_own(scenes):
     wrong = dataclasses.replace(sweep, models=dataclasses.replace(settings, runtime=("fast",)))
     with pytest.raises(ConfigError, match="No runtime is called 'fast'"):
         make_choices(wrong, scenes, models)
+
+
+@pytest.mark.parametrize(("emulated", "installed"), [(True, True), (False, True), (True, False)])
+def test_emulated_precisions_are_left_out_and_installed_runtimes_take_part(scenes, monkeypatch, emulated, installed):
+    monkeypatch.setattr(model_settings, "computes_bfloat16", lambda _: not emulated)
+    monkeypatch.setattr(model_settings, "find_spec", lambda name: name if installed else None)
+    settings = ModelSettings(constraints=("held",), batch=(1,))
+    sweep = dataclasses.replace(tiny_sweep(), models=settings)
+    choices = make_choices(sweep, scenes, {"carried": tiny_emulator(scenes.scene)})
+    runtimes = [choice.settings["runtime"] for choice in choices if choice.kind is Kind.MODEL]
+    assert runtimes == ["eager"] + ["openvino"] * installed
+    assert settings.precisions(CPU) == ("float32", "bfloat16")[: 1 if emulated else 2]
+    lines = " ".join(settings.left_out(CPU))
+    assert ("bfloat16 is left out" in lines, "OpenVINO" in lines) == (emulated, not installed)
+    alone = dataclasses.replace(settings, precision=("bfloat16",))
+    assert alone.precisions(CPU) == ("bfloat16",)
+    assert settings.runtimes(torch.device("cuda")) == ("eager",)
 
 
 def test_a_predictor_of_another_package_is_a_choice(scenes):
