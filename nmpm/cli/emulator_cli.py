@@ -24,7 +24,7 @@ from nmpm.cli.console import BriefParser, explain, is_of_other_packages
 from nmpm.cli.early_checks import UsageError
 from nmpm.cli.matched_run import MatchedRun, add_arguments, stored_scene
 from nmpm.cli.options import check_folder
-from nmpm.cli.run_folder import CHECKPOINTS, SAVERS, RunFolder
+from nmpm.cli.run_folder import CHECKPOINTS, SAVERS, RunFolder, next_folder
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.inspection.quick import contradictions_warning
 from nmpm.data.loading.sources import FolderSource
@@ -64,6 +64,7 @@ class EmulatorCLI(LightningCLI):
     def __init__(self, command: str, note: str, locks: list[int], **options: Any) -> None:
         self.command, self.note, self.locks = command, note, locks
         self.bfloat16_replaced = False
+        self.former = ""
         super().__init__(EmulatorModule, TrajectoryDataModule, **options)
 
     # Parser
@@ -105,6 +106,9 @@ class EmulatorCLI(LightningCLI):
         trainer, optimizer = config["trainer"], config["model"].get("optimizer")
         config["weights_only"] = True  # checkpoints are read as tensors and plain data
         trainer["default_root_dir"] = trainer["default_root_dir"] or "runs/default"
+        if self.subcommand == "fit" and not self._goes_on():
+            root, self.former = next_folder(Path(trainer["default_root_dir"]))
+            trainer["default_root_dir"] = str(root)
         check_folder("--trainer.default_root_dir", Path(trainer["default_root_dir"]))
         if self.subcommand != "fit" and not config["ckpt_path"]:
             raise ConfigError(
@@ -181,11 +185,15 @@ class EmulatorCLI(LightningCLI):
             return None
         return self.run_folder.checkpoint(stated) if stated in SAVERS else Path(stated)
 
+    def _goes_on(self) -> bool:
+        """Whether a fit goes on with a run of its folder, instead of starting a new one."""
+        path = self.config[self.subcommand]["ckpt_path"]
+        return bool(path) and (path in SAVERS or self.run_folder.holds(Path(path)))
+
     # Runs
 
     def before_fit(self) -> None:
         """Check, before data are simulated, that the training can run, and lock the run's folder."""
-        config = self.config_init[self.subcommand]
         check_endless_batches(self.trainer)
         for logger in self.trainer.loggers:
             check_folder("The logger's save_dir", Path(logger.save_dir or "."))
@@ -201,9 +209,9 @@ class EmulatorCLI(LightningCLI):
             return
         self.locks.append(self.run_folder.lock())
         self.run_folder.remove_unfinished()
-        if resumed is None or not self.run_folder.holds(Path(config["ckpt_path"])):
+        if not self._goes_on():
             self.run_folder.check_new()
-        self._print_start(f"Files: {self.run_folder.root}. Ctrl-C stops after a step, to go on later.\n")
+        self._print_start(f"{self.former}Files: {self.run_folder.root}. Ctrl-C stops after a step, to go on later.\n")
         if resumed is None and isinstance(self.datamodule.data_source, FolderSource):
             sys.stderr.write(contradictions_warning(self.datamodule.data_source))
 

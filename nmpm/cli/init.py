@@ -68,14 +68,10 @@ def run(words: list[str]) -> None:
 
 
 def write_for_fit(path: Path, options: Options, root: Path, minutes: float) -> Path:
-    """Write the configuration of a training without one into its run's folder, and print its most important lines.
+    """Write the configuration of a training without one into its run's folder, and print its most important lines."""
+    from nmpm.cli.run_folder import next_folder
 
-    Raises:
-        ConfigError: if the folder already holds a run.
-    """
-    from nmpm.cli.run_folder import RunFolder
-
-    RunFolder.of(root, {}).check_new()
+    root, _ = next_folder(root)
     root.mkdir(parents=True, exist_ok=True)
     out = root / "init.yaml"
     lines = _write(path, options, out, str(root), minutes)

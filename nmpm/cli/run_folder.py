@@ -1,8 +1,9 @@
-"""The folder of a training run: one fit at a time, and no new run over an old one."""
+"""The folder of a training run: one fit at a time, and each new run in a folder of its own."""
 
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -79,17 +80,23 @@ class RunFolder:
         """Whether a checkpoint is one of this run, whatever path leads to it."""
         return checkpoint.resolve().parent in {path.resolve().parent for path in self.checkpoints.values()}
 
-    def check_new(self) -> None:
-        """Raise ConfigError if there is a checkpoint or a report, which a new run would write over."""
+    def results(self) -> list[Path]:
+        """Checkpoints and the report, which a new run would write over."""
         folders = {path.parent for path in self.checkpoints.values()}
-        old = [path for folder in folders for path in folder.glob("*.ckpt")]
-        old += [path for path in [self.root / "report.json"] if path.is_file()]
-        if old:
-            last = self.checkpoints["last"].is_file()
-            resume = f"Go on with it by nmpm fit --resume {self.root}" if last else "Remove it"
+        checkpoints = [path for folder in folders for path in folder.glob("*.ckpt")]
+        return checkpoints + [path for path in [self.root / "report.json"] if path.is_file()]
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether the run was interrupted, and can go on."""
+        return self.checkpoints["last"].is_file() and not (self.root / "report.json").is_file()
+
+    def check_new(self) -> None:
+        """Raise ConfigError if a new run would write over results."""
+        if results := self.results():
             raise ConfigError(
-                f"{self.root} already holds a run ({old[0].name}). {resume}, or choose another folder with"
-                " --trainer.default_root_dir."
+                f"{results[0]} is of another run, and would be written over: choose other folders with"
+                " --trainer.default_root_dir, --checkpoint.dirpath and --resume.dirpath."
             )
 
     def checkpoint(self, *names: str) -> Path:
@@ -107,3 +114,26 @@ class RunFolder:
             f"{self.root}: there is no {' or '.join(map(str, paths))}; checkpoints there: {others}. To start a new run,"
             " call nmpm fit with --config alone."
         )
+
+
+def next_folder(root: Path) -> tuple[Path, str]:
+    """The first of root, root/version_1, root/version_2, … without results of a run, and a line about those before it.
+
+    All ranks of a training find the same one: none writes results before all have started.
+    """
+    former, folder = [], RunFolder.of(root, {})
+    while folder.results():
+        former.append(folder)
+        folder = RunFolder.of(root / f"version_{len(former)}", {})
+    return folder.root, _describe(former)
+
+
+def _describe(runs: list[RunFolder]) -> str:
+    """A line about earlier runs: the last that can go on, with the command; empty without runs."""
+    if not runs:
+        return ""
+    unfinished = [run.root for run in runs if run.unfinished]
+    if not unfinished:
+        return f"{runs[-1].root} holds a run; this is a new one.\n"
+    command = shlex.join(["nmpm", "fit", "--resume", str(unfinished[-1])])
+    return f"{unfinished[-1]} holds an unfinished run, with which {command} goes on; this is a new one.\n"

@@ -105,7 +105,6 @@ def _add_fine_tuning(options: Sequence[Option], path: Path) -> list[Option]:
 
     given = {option.name: option.value for option in options}
     root = given.get(ROOT) or f"runs/{dataset_name(path)}"
-    RunFolder.of(Path(root), {}).check_new()
     return [Option("--config", str(FINE_TUNING)), Option(ROOT, root), *options]
 
 
@@ -257,7 +256,7 @@ OPTIONS = {
     "--print_config": "print the configuration that results, and stop",
 }
 TRAINER = {
-    "default_root_dir": "folder of the run's files",
+    "default_root_dir": "folder of the run's files; further runs go to its version_1, version_2, ...",
     "max_steps, max_time": "end of the training: steps, or DD:HH:MM:SS, whichever is first",
     "accelerator, devices": "where to compute: auto, cpu, gpu; how many devices, see docs/scaling.md",
     "precision": "of the network: bf16-mixed, or 32-true, which CPUs without bfloat16 take in its place",

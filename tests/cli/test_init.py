@@ -28,8 +28,12 @@ def test_fit_without_a_configuration_writes_and_takes_that_of_init(make_dataset,
     assert json.loads(Path("run/report.json").read_text())["training"]["steps"] == 2  # options override
     one, other = (yaml.safe_load(Path(file).read_text()) for file in ("made.yaml", "run/init.yaml"))
     assert one["data"] == other["data"]
-    assert main(fit) == 1
-    assert "run already holds a run" in capsys.readouterr().err
+    assert main(fit) == 0
+    said = capsys.readouterr().out
+    assert "No --config: wrote run/version_1/init.yaml" in said
+    assert "run holds a run; this is a new one.\nFiles: run/version_1. " in said
+    assert json.loads(Path("run/version_1/report.json").read_text())["training"]["steps"] == 2
+    assert sorted(path.name for path in Path("run").iterdir() if path.is_dir()) == ["checkpoints", "logs", "version_1"]
 
 
 def test_a_configuration_states_obstacles_that_move_as_recorded(make_dataset):

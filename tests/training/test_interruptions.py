@@ -20,7 +20,7 @@ import yaml
 from lightning.pytorch import Callback
 
 from nmpm.cli import main
-from nmpm.cli.run_folder import RunFolder
+from nmpm.cli.run_folder import RunFolder, next_folder
 from nmpm.errors import ConfigError
 from tests.conftest import make_dataset
 
@@ -284,14 +284,30 @@ def test_a_folder_is_trained_in_by_one_process_and_free_again_when_that_is_kille
     os.close(folder.lock())
 
 
+def touch(*paths):
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def test_a_new_run_takes_the_next_folder_and_an_unfinished_one_is_named(tmp_path):
+    root, first, second = tmp_path / "my runs", tmp_path / "my runs/version_1", tmp_path / "my runs/version_2"
+    touch(root / "logs/metrics.csv", root / "config.yaml", root / ".lock")  # killed before its first checkpoint
+    assert next_folder(root) == (root, "")
+    touch(root / "checkpoints/best.ckpt", root / "report.json")
+    assert next_folder(root) == (first, f"{root} holds a run; this is a new one.\n")
+    touch(first / "checkpoints/last.ckpt")
+    command = f"nmpm fit --resume '{first}'"
+    note = f"{first} holds an unfinished run, with which {command} goes on; this is a new one.\n"
+    assert next_folder(root) == (second, note)
+    touch(second / "report.json")
+    assert next_folder(root) == (root / "version_3", note)
+
+
 @pytest.mark.parametrize("old", ["checkpoints/best.ckpt", "checkpoints/last.ckpt", "report.json"])
 def test_a_run_is_not_written_over(tmp_path, old):
     folder = RunFolder(tmp_path, {name: tmp_path / "checkpoints" / f"{name}.ckpt" for name in ("last", "best")})
-    (tmp_path / "logs").mkdir(parents=True)
-    (tmp_path / "logs" / "metrics.csv").touch()  # of a run that was killed before its first checkpoint
     folder.check_new()
-    (tmp_path / old).parent.mkdir(parents=True, exist_ok=True)
-    (tmp_path / old).touch()
-    with pytest.raises(ConfigError, match="already holds a run") as refusal:
+    touch(tmp_path / old)
+    with pytest.raises(ConfigError, match=rf"{tmp_path / old} is of another run, and would be written over: choose"):
         folder.check_new()
-    assert ("nmpm fit --resume" in str(refusal.value)) == ("last" in old)
