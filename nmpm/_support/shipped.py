@@ -28,6 +28,12 @@ def user_zoo() -> Path:
     return user_home() / "zoo"
 
 
+def entry_names(zoo: Path) -> list[str]:
+    """Names of the models in the folder of a zoo, such as "goop" or "goop/fast"."""
+    cards = (*zoo.glob("*/card.yaml"), *zoo.glob("*/*/card.yaml"))
+    return sorted(card.parent.relative_to(zoo).as_posix() for card in cards)
+
+
 def config_names() -> list[str]:
     """Names of the shipped configurations, as `--config` takes them."""
     root = shipped_folder("configs")

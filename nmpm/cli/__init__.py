@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -60,6 +61,8 @@ first steps:
   nmpm trade goop                              what accuracy costs in time: model or simulator?
 
 Add --help to any command for its options and examples; nmpm --version prints the version.
+Tab completes commands, options and models in bash and zsh after
+  eval "$(register-python-argcomplete nmpm)"
 A --config that is not a file in the working directory is looked up among the shipped ones:
 {configs}.
 """
@@ -97,6 +100,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         an interruption.
     """
     limit_spinning()
+    if "_ARGCOMPLETE" in os.environ:  # the shell asks what a line may go on with
+        from nmpm.cli.completion import complete
+
+        complete()
+        return 0
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help", "help"):
         sys.stdout.write(usage())

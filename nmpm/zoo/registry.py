@@ -22,7 +22,7 @@ import torch
 
 from nmpm._support.devices import device_name, find_device
 from nmpm._support.messages import one_line, suggestion
-from nmpm._support.shipped import shipped_folder, user_zoo
+from nmpm._support.shipped import entry_names, shipped_folder, user_zoo
 from nmpm.errors import ConfigError, ZooError
 from nmpm.zoo.card import CARD, stated_milliseconds
 from nmpm.zoo.choice import Limits, choose
@@ -45,12 +45,8 @@ class Zoo:
     @staticmethod
     def list(root: Root = None) -> builtins.list[str]:
         """Names of the models; raises ZooError if `root` is given and is not a folder."""
-        names = {
-            card.parent.relative_to(folder).as_posix()
-            for folder in _roots(root)
-            for card in (*folder.glob(f"*/{CARD}"), *folder.glob(f"*/*/{CARD}"))
-        }
-        return sorted(name for name in names if _is_name(name))
+        names = {name for folder in _roots(root) for name in entry_names(folder) if _is_name(name)}
+        return sorted(names)
 
     @staticmethod
     def folder(name: str, root: Root = None) -> Path:
