@@ -37,7 +37,7 @@ def complete() -> None:
 
 
 def _complete_by(parser: argparse.ArgumentParser, *_: Any) -> None:
-    argcomplete.autocomplete(parser, always_complete_options=False, default_completer=complete_value)
+    argcomplete.autocomplete(parser, always_complete_options=False, default_completer=complete_value)  # type: ignore[arg-type]
 
 
 def _commands() -> argparse.ArgumentParser:
