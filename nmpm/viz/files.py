@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nmpm.data.convert import Options
 from nmpm.data.described import read_description
@@ -65,12 +66,23 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
         obstacle=trajectory.position[0, ~moving],
         periodic=scene.periodic,
         gravity=trajectory_gravity(trajectory.attributes, scene, f"{split.path}, trajectory {index}"),
-        title=f"{split.path.name}, " + (f"{len(others) + 1} members" if others else f"trajectory {index}"),
+        title=_title(split, index, material_names(trajectory.particle_type[moving], names), len(others)),
         fields={name: {label: values[:frames, moving]} for name, values in fields.items() if values.shape[1] > 1},
         prescribed=frozenset(names[number] for number in prescribed),
         further_members={name: position[:frames, moving] for name, position in others.items()},
         densities=dict(zip(scene.materials, scene.densities, strict=False)),
     )
+
+
+def _title(split: Split, index: int, materials: NDArray[np.str_], others: int) -> str:
+    """Model, or folder and file, and which scene: "waterramps: 1,620 particles of water"."""
+    _, predicted, model = str(split.attributes(index).get("generator", "")).partition("predicted by ")
+    source = (
+        model.removeprefix("the zoo model ") if predicted else f"{split.path.resolve().parent.name}/{split.path.name}"
+    )
+    number = f", trajectory {index}" if len(split) > others + 1 else ""
+    kinds = ", ".join(dict.fromkeys(materials.tolist()))
+    return f"{source}{number}: {len(materials):,} particles of {kinds}" + (f", {others + 1} members" if others else "")
 
 
 def member_indices(split: Split, index: int) -> range:

@@ -54,7 +54,7 @@ def test_names_cannot_leave_the_data():
     page = view(trajectories)
     assert not re.findall(r"""(?:src|href)=|url\(|https?://|import\(""", page.html)  # nothing is loaded from elsewhere
     assert page._repr_html_().startswith("<iframe srcdoc=")
-    assert 'sandbox="allow-scripts"' in page._repr_html_()
+    assert 'sandbox="allow-scripts allow-downloads"' in page._repr_html_()
     assert "alert(1)</script>" not in page.html
     assert description(page)["title"] == hostile
     assert "<script>alert" not in page._repr_html_()

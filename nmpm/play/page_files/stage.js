@@ -113,7 +113,7 @@ class Stage {
     const pixels = [x, this.canvas.height / ratio - y - height, width, height].map((value) => Math.round(value * ratio));
     const { matrix, unit } = this.camera.view(width, height), speed = element("colour").value === "speed";
     const mode = speed && film.before === film.count ? MODES.speed : MODES.material;
-    const look = { mode, top: scene.fastest * scene.pace, plain: [...this.theme.ghost, 1], diameter: 1.1 * scene.spacing * unit * ratio };
+    const look = { mode, top: scene.fastest * scene.pace, plain: [...this.theme.ghost, 1], diameter: DISC_DIAMETER * scene.spacing * unit * ratio };
     this.drawing.startPanel(pixels, matrix, this.theme);
     for (const body of this.bodies) drawBody(this.drawing, body, body.id === this.touched ? this.theme.faint : this.theme.ghost);
     this.drawing.drawObstacles(matrix, { ...look, mode: MODES.plain });

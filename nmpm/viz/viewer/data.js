@@ -29,6 +29,9 @@ async function readField(packed) {
   return packed && undoDifferences(await inflate(packed), scene.frames);
 }
 
+/** Shares of the colour scale, which runs from dark to light, that slow and fast have: fast stands out from the page. */
+const scaleEnds = () => (document.documentElement.dataset.theme === "dark" ? [0.25, 0.99] : [0.62, 0.01]);
+
 /** #rrggbb as three numbers in [0, 1]. */
 function readColour(hex) {
   return [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16) / 255);

@@ -1,10 +1,10 @@
-// Drawing with WebGL: particles as discs (shaded as balls in 3-D), walls as filled boxes and lines.
+// Drawing with WebGL: particles as discs (shaded as balls in 3-D), walls as filled boxes, floor and frame as lines.
 
 const POINTS = `#version 300 es
 in vec3 position, previous, reference, material;
 in float field;
 uniform mat4 view; uniform vec3 low, extent, period; uniform vec4 plain;
-uniform float diameter, top, opacity; uniform int mode;   // see MODES below; 3 is the colour \`plain\`
+uniform vec2 ends; uniform float diameter, top, opacity; uniform int mode;   // see MODES below; 3 is the colour \`plain\`
 uniform highp sampler2D scale;
 out vec4 colour;
 bool absent(vec3 p) { return p.x > 0.999993; }  // ABSENT of page.py
@@ -13,11 +13,12 @@ void main() {
   vec3 x = low + extent * position;
   gl_Position = absent(position) ? vec4(2.0, 2.0, 2.0, 1.0) : view * vec4(x, 1.0);  // outside of the clip volume
   gl_PointSize = max(diameter / gl_Position.w, 1.5);
+  // Most particles are slow, most errors small: the square root gives them more of the scale.
   float value = mode == 4 ? field
     : absent(mode == 1 ? previous : reference) ? 0.0
-    : length(nearest(extent * (mode == 1 ? position - previous : position - reference))) / top;
+    : sqrt(length(nearest(extent * (mode == 1 ? position - previous : position - reference))) / top);
   colour = mode == 0 ? vec4(material, 1.0) : mode == 3 ? plain
-    : vec4(texture(scale, vec2(clamp(value, 0.002, 0.998), 0.5)).rgb, 1.0);
+    : vec4(texture(scale, vec2(mix(ends.x, ends.y, clamp(value, 0.0, 1.0)), 0.5)).rgb, 1.0);
   colour.a *= opacity;
 }`;
 const DISC = `#version 300 es
@@ -28,13 +29,16 @@ void main() {
   float r = dot(p, p);
   if (r > 1.0) discard;
   float light = ball ? 0.45 + 0.55 * max(dot(vec3(p.x, -p.y, sqrt(1.0 - r)), normalize(vec3(-0.4, 0.7, 0.8))), 0.0) : 1.0;
-  pixel = vec4(colour.rgb * light, colour.a * (ball ? 1.0 : smoothstep(1.0, 0.75, r)));
+  pixel = vec4(colour.rgb * light, colour.a * (ball ? 1.0 : smoothstep(1.0, 1.0 - fwidth(r), r)));
 }`;
 const LINES = `#version 300 es
 in vec3 position; uniform mat4 view; void main() { gl_Position = view * vec4(position, 1.0); }`;
 const FLAT = `#version 300 es
 precision highp float; uniform vec4 plain; out vec4 pixel; void main() { pixel = plain; }`;
 const MODES = { material: 0, speed: 1, error: 2, plain: 3, field: 4 };
+/** Diameter of a disc in spacings: above √2, from which on the discs of a square lattice leave no gaps. */
+const DISC_DIAMETER = 1.55;
+const FLOOR_TILES = 10;
 /** Which positions besides the particles' own a mode reads: 1 of the frame before, 2 of the reference. */
 const OTHERS = { [MODES.speed]: 1, [MODES.error]: 2 };
 
@@ -93,6 +97,7 @@ class Drawing {
   /** Clears a panel, (x, y, width, height) in pixels from the canvas's lower left corner, and draws the box. */
   startPanel(panel, view, theme) {
     const gl = this.gl;
+    this.ends = scaleEnds();
     gl.viewport(...panel);
     gl.scissor(...panel);
     gl.enable(gl.SCISSOR_TEST);
@@ -106,7 +111,10 @@ class Drawing {
       this.drawCorners(rectangle(scene.domain), gl.TRIANGLE_STRIP, theme.wall);
       this.drawCorners(rectangle(scene.bounds), gl.TRIANGLE_STRIP, theme.inside);
     } else {
-      this.drawCorners(edges(scene.bounds), gl.LINES, theme.wall);
+      const floor = floorOf(scene.bounds), ticks = Array.from({ length: FLOOR_TILES + 1 }, (_, tick) => tick / FLOOR_TILES);
+      this.drawCorners([floor(0, 0), floor(1, 0), floor(0, 1), floor(1, 1)], gl.TRIANGLE_STRIP, theme.inside);
+      this.drawCorners(ticks.flatMap((t) => [floor(t, 0), floor(t, 1), floor(0, t), floor(1, t)]), gl.LINES, theme.wall);
+      this.drawCorners(edges(scene.bounds), gl.LINES, theme.ghost);
     }
   }
 
@@ -183,6 +191,7 @@ class Drawing {
     gl.uniform3f(at("period"), ...inSpace(scene.period));
     gl.uniform4f(at("plain"), ...look.plain);
     gl.uniform1f(at("diameter"), look.diameter);
+    gl.uniform2f(at("ends"), ...this.ends);
     gl.uniform1f(at("top"), look.top);
     gl.uniform1f(at("opacity"), opacity);
     gl.uniform1i(at("mode"), look.mode);
@@ -194,6 +203,16 @@ class Drawing {
 
 const inSpace = (vector) => [...vector, 0].slice(0, 3);
 const rectangle = ([[x0, x1], [y0, y1]]) => [[x0, y0, 0], [x1, y0, 0], [x0, y1, 0], [x1, y1, 0]];
+
+/** Points of a box's floor from shares along its two horizontal axes. */
+const floorOf = (box) => (...shares) => {
+  const point = box.map(([low]) => low);
+  shares.forEach((share, at) => {
+    const axis = (scene.up + 1 + at) % 3, [low, high] = box[axis];
+    point[axis] = low + share * (high - low);
+  });
+  return point;
+};
 
 /** The twelve edges of a box, as pairs of corners. */
 function edges(box) {

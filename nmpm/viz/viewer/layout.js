@@ -12,6 +12,9 @@ function panelRectangles(count, width, height, aspect) {
     [(i % best.columns) * best.w, Math.floor(i / best.columns) * best.h, best.w, best.h].map(Math.round));
 }
 
+// In 3-D: the first view, half of the camera's vertical angle, and the share of a panel that the box fills.
+const ORBIT = { turn: 0.5, tilt: 0.35, halfAngle: 0.35, filled: 0.96 };
+
 /** The camera: in 2-D it moves and zooms, in 3-D it turns and zooms. */
 class Camera {
   constructor() {
@@ -21,8 +24,8 @@ class Camera {
   reset() {
     this.centre = scene.domain.map(([low, high]) => (low + high) / 2);
     this.zoom = 1;
-    this.turn = 0.5;
-    this.tilt = 0.35;
+    this.turn = ORBIT.turn;
+    this.tilt = ORBIT.tilt;
   }
 
   get sizes() {
@@ -31,7 +34,22 @@ class Camera {
 
   /** Width over height of the box as it is seen. */
   get aspect() {
-    return scene.dim === 2 ? this.sizes[0] / this.sizes[1] : 1.2;
+    if (scene.dim === 2) return this.sizes[0] / this.sizes[1];
+    const most = (axis) => Math.max(...this.corners().map((corner) => Math.abs(corner[axis])));
+    return most(0) / most(1);
+  }
+
+  /** The box's corners from its middle, (right, up, toward the viewer), as they are seen before it is turned. */
+  corners() {
+    const rows = orbitAxes(scene.up, ORBIT.turn, ORBIT.tilt);
+    return edges(this.sizes.map((size) => [-size / 2, size / 2])).map((corner) =>
+      rows.map((row) => row.reduce((sum, value, axis) => sum + value * corner[axis], 0)));
+  }
+
+  /** The least distance from which the whole box is seen. */
+  distance(width, height) {
+    return Math.max(...this.corners().map(([right, up, toward]) =>
+      toward + Math.max((Math.abs(right) * height) / width, Math.abs(up)) / (ORBIT.filled * Math.tan(ORBIT.halfAngle))));
   }
 
   /** Pixels to a unit of length, in 2-D. */
@@ -46,9 +64,9 @@ class Camera {
       const scale = this.scale(width, height);
       return { matrix: flatView(this.centre, scale, width, height), unit: scale };
     }
-    const size = Math.hypot(...this.sizes), distance = (1.4 * size) / this.zoom;
+    const size = Math.hypot(...this.sizes), distance = this.distance(width, height) / this.zoom;
     const matrix = orbitView(this.centre, scene.up, this.turn, this.tilt, distance, size, width, height);
-    return { matrix, unit: height / (2 * Math.tan(0.35)) };
+    return { matrix, unit: height / (2 * Math.tan(ORBIT.halfAngle)) };
   }
 
   /** Follows a drag by (x, y) pixels in a panel. */

@@ -10,20 +10,32 @@ function colourLegend({ colour, mode, fieldIndex }) {
       return entry;
     });
   }
-  const bar = document.createElement("canvas"), context = bar.getContext("2d");
-  bar.width = scene.scale.length;
-  bar.height = 1;
-  scene.scale.forEach((hex, at) => {
-    context.fillStyle = hex;
-    context.fillRect(at, 0, 1, 1);
-  });
   if (mode === MODES.field) {
     const { low, high } = scene.fields[fieldIndex];
-    return [`${Number(low.toPrecision(4))} or less`, bar, `${Number(high.toPrecision(4))} or more`];
+    return [scaleBar([low, (low + high) / 2, high], "")];
   }
-  const unit = colour === "speed" ? "length per second" : "length";
   const end = colour === "speed" ? scene.fastest / scene.dt : scene.worst;
-  return ["0", bar, `${Number(end.toPrecision(2))} ${unit} or more`];
+  return [scaleBar([0, end / 4, end], colour === "speed" ? "length per second" : "length")]; // a square root: see drawing.js
+}
+
+/** The colour scale with numbers at its lower end, middle and upper end. */
+function scaleBar(numbers, unit) {
+  const entry = document.createElement("span"), bar = document.createElement("canvas"), context = bar.getContext("2d");
+  const [from, to] = scaleEnds(), last = scene.scale.length - 1;
+  entry.className = "scale";
+  bar.width = scene.scale.length;
+  bar.height = 1;
+  for (let at = 0; at <= last; at++) {
+    context.fillStyle = scene.scale[Math.round(from * last + (to - from) * at)];
+    context.fillRect(at, 0, 1, 1);
+  }
+  const texts = numbers.map((number) => {
+    const text = document.createElement("small");
+    text.textContent = Number(number.toPrecision(2));
+    return text;
+  });
+  entry.append(bar, unit, ...texts);
+  return entry;
 }
 
 /** Says where gravity points: an angle from straight down, counterclockwise in radians. */

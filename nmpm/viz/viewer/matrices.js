@@ -14,23 +14,34 @@ function flatView(centre, scale, width, height) {
   return new Float32Array([x, 0, 0, 0, 0, y, 0, 0, 0, 0, 0, 0, -x * centre[0], -y * centre[1], 0, 1]);
 }
 
-/** From space to the viewport, seen from a sphere around `centre`; `up` is the vertical axis. */
+/** Right, up and toward the viewer (rows), of a viewer turned about the vertical axis `up` and tilted above it. */
+function orbitAxes(up, turn, tilt) {
+  const [c, s, d, e] = [Math.cos(turn), Math.sin(turn), Math.cos(tilt), Math.sin(tilt)];
+  // In coordinates (a, b, up) with the horizontal axes a and b, right-handed.
+  return [[c, s, 0], [-s * e, c * e, d], [s * d, -c * d, e]].map((row) => [0, 1, 2].map((axis) => row[(axis - up + 2) % 3]));
+}
+
+/** From space to the viewport, seen from a sphere around `centre`. */
 function orbitView(centre, up, turn, tilt, distance, size, width, height) {
-  const forward = 1 / Math.tan(0.35), near = distance / 50, far = distance + 4 * size;
+  const forward = 1 / Math.tan(ORBIT.halfAngle), near = distance / 50, far = distance + 4 * size;
   const perspective = new Float32Array([
     (forward * height) / width, 0, 0, 0, 0, forward, 0, 0,
     0, 0, (far + near) / (near - far), -1, 0, 0, (2 * far * near) / (near - far), 0,
   ]);
-  const [c, s, d, e] = [Math.cos(turn), Math.sin(turn), Math.cos(tilt), Math.sin(tilt)];
-  // In coordinates (a, b, up) with the horizontal axes a and b, right-handed.
-  const rows = [[c, s, 0], [-s * e, c * e, d], [s * d, -c * d, e]]; // right, up, toward the viewer
-  const axes = [(up + 1) % 3, (up + 2) % 3, up];
   const camera = new Float32Array(16);
-  rows.forEach((row, r) => row.forEach((value, k) => (camera[4 * axes[k] + r] = value)));
-  rows.forEach((row, r) => {
-    camera[12 + r] = -row.reduce((sum, value, k) => sum + value * centre[axes[k]], 0);
+  orbitAxes(up, turn, tilt).forEach((row, r) => {
+    row.forEach((value, axis) => (camera[4 * axis + r] = value));
+    camera[12 + r] = -row.reduce((sum, value, axis) => sum + value * centre[axis], 0);
   });
   camera[14] -= distance;
   camera[15] = 1;
   return multiply(perspective, camera);
+}
+
+/** Moves points along an axis to a plane across it. */
+function flatten(axis, at) {
+  const matrix = new Float32Array(16);
+  for (let i = 0; i < 4; i++) matrix[5 * i] = Number(i !== axis);
+  matrix[12 + axis] = at;
+  return matrix;
 }

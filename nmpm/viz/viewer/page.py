@@ -28,10 +28,10 @@ from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
 SCRIPTS = (
     "data.js", "matrices.js", "drawing.js", "density.js", "layout.js", "curve.js", "legend.js", "ensemble.js",
-    "viewer.js",
+    "saving.js", "viewer.js",
 )  # fmt: skip
-COLOUR_SCALE = "viridis"
-TOP_PERCENTILE = 99.5
+COLOUR_SCALE = "YlGnBu_r"
+TOP_PERCENTILE = 99.0
 """Of speeds and errors: what the upper end of the colour scale stands for."""
 FIELD_PERCENTILES = (0.5, 99.5)
 """Of a field's values: what the ends of the colour scale stand for."""
@@ -98,9 +98,7 @@ class ViewerPage:
 
     def _repr_html_(self) -> str:
         page = html.escape(self.html, quote=True)
-        return (
-            f'<iframe srcdoc="{page}" sandbox="allow-scripts" style="width: 100%; height: 640px; border: 0"></iframe>'
-        )
+        return f'<iframe srcdoc="{page}" sandbox="allow-scripts allow-downloads" style="width: 100%; height: 640px; border: 0"></iframe>'
 
 
 def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
@@ -111,7 +109,7 @@ def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
     }
     first, *others = positions.values()
     colours = material_colours(trajectories.materials)
-    rgb = np.array([colours[name] for name in trajectories.material.tolist()], dtype=np.uint8)
+    index = {name: number for number, name in enumerate(colours)}
     sampled = np.unique(np.linspace(0, len(first) - 1, SAMPLED_FRAMES).astype(int))
     moved = [path[sampled[1:]] - path[sampled[1:] - 1] for path in positions.values()]
     return {
@@ -125,7 +123,7 @@ def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
         "up": vertical_axis(trajectories),
         "tilt": trajectories.tilt,
         "materials": [{"name": name, "colour": hex_code(colour)} for name, colour in colours.items()],
-        "colours": pack_bytes(rgb),
+        "particles": pack_bytes(np.array([index[name] for name in trajectories.material.tolist()], dtype=np.uint8)),
         "scale": colour_scale(),
         "fastest": _nearly_largest(trajectories, moved),
         "worst": _nearly_largest(trajectories, [other[sampled] - first[sampled] for other in others]),

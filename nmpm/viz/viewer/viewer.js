@@ -1,4 +1,4 @@
-// The viewer: playing, choices, keys.
+// The viewer: playing, choices, keys, and what the pointer is at.
 
 const RATES = [5, 15, 30, 60, 120, 240];
 const MOST_PIXELS = 2; // along each axis, to a pixel of the page: phones have 3, which nobody sees in discs
@@ -6,16 +6,21 @@ const THEME_COLOURS = ["page", "text", "faint", "line", "inside", "wall", "ghost
 const element = (id) => document.getElementById(id);
 
 class Viewer {
-  /** @param fields For each field of the scene, values of each trajectory or null; @param members further ones. */
-  constructor(drawing, trajectories, fields, members) {
-    Object.assign(this, { drawing, trajectories, fields, frame: 0, playing: false, drawn: 0, camera: new Camera() });
+  /**
+   * @param fields For each field of the scene, values of each trajectory or null; @param members further ones;
+   * @param materials index of each particle's material.
+   */
+  constructor(drawing, trajectories, fields, members, materials) {
+    Object.assign(this, { drawing, trajectories, fields, materials, frame: 0, playing: false, drawn: 0, camera: new Camera() });
     this.setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
     this.fillChoices();
     if (members.length) this.ensemble = new Ensemble(drawing, trajectories.at(-1), members);
     this.listen();
     new ResizeObserver(() => this.show()).observe(element("scene"));
-    this.setColour("material");
+    const moves = scene.frames > 1, alone = scene.materials.length === 1 && !members.length;
+    this.setColour(moves && alone ? "speed" : "material");
     this.seek(0);
+    if (moves && !matchMedia("(prefers-reduced-motion: reduce)").matches) this.toggle();
   }
 
   get frames() { return scene.frames; }
@@ -32,7 +37,7 @@ class Viewer {
     element("title").textContent = document.title = scene.title;
     element("colour").replaceChildren(...names.map((name) => new Option(name, name)), ...own);
     element("rate").replaceChildren(...RATES.map((rate) =>
-      new Option(`${rate} frames/s (${Number((rate * scene.dt).toPrecision(2))} × real time)`, rate, rate === 60, rate === 60)));
+      new Option(`${Number((rate * scene.dt).toPrecision(2))} × real time`, rate, rate === 60, rate === 60)));
     element("layout-choice").hidden = !many;
     element("errors").hidden = !many;
     element("slider").max = scene.frames - 1;
@@ -41,7 +46,7 @@ class Viewer {
   listen() {
     const on = (id, event, action) => element(id).addEventListener(event, action);
     on("play", "click", () => this.toggle());
-    on("slider", "input", () => this.seek(Number(element("slider").value)));
+    on("slider", "input", () => this.stopAt(Number(element("slider").value)));
     on("colour", "change", () => this.setColour(this.colour));
     on("layout", "change", () => this.show());
     on("members", "change", () => this.setMembers(this.ensemble.mode));
@@ -49,9 +54,12 @@ class Viewer {
     on("reset", "click", () => this.reset());
     on("theme", "click", () => this.turnTheme());
     on("help", "click", () => element("keys").showModal());
-    on("curve", "click", (event) => this.seek(frameAt(element("curve"), event.offsetX)));
+    on("curve", "click", (event) => this.stopAt(frameAt(element("curve"), event.offsetX)));
+    on("picture", "click", () => savePicture(this));
+    on("film", "click", () => saveFilm(this));
     on("scene", "pointerdown", (event) => element("scene").setPointerCapture(event.pointerId));
-    on("scene", "pointermove", (event) => event.buttons && this.drag(event));
+    on("scene", "pointermove", (event) => this.follow(event));
+    on("scene", "pointerleave", () => this.follow(null));
     on("scene", "wheel", (event) => this.zoom(event));
     document.addEventListener("keydown", (event) => this.press(event));
   }
@@ -62,10 +70,11 @@ class Viewer {
     if (event.target.tagName === "BUTTON" && event.key === " ") return; // it presses the button
     const step = event.shiftKey ? 10 : 1;
     const actions = {
-      " ": () => this.toggle(), ArrowRight: () => this.seek(this.frame + step), ArrowLeft: () => this.seek(this.frame - step),
-      Home: () => this.seek(0), End: () => this.seek(this.frames - 1), "[": () => this.changeRate(-1), "]": () => this.changeRate(1),
+      " ": () => this.toggle(), ArrowRight: () => this.stopAt(this.frame + step), ArrowLeft: () => this.stopAt(this.frame - step),
+      Home: () => this.stopAt(0), End: () => this.stopAt(this.frames - 1), "[": () => this.changeRate(-1), "]": () => this.changeRate(1),
       c: () => this.setColour(next(element("colour"))), o: () => this.setLayout(next(element("layout"))),
       m: () => this.ensemble && this.setMembers(next(element("members"))), r: () => this.reset(), t: () => this.turnTheme(), f: () => document.documentElement.requestFullscreen(),
+      p: () => savePicture(this), v: () => saveFilm(this),
       "?": () => element("keys").showModal(),
     };
     const action = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
@@ -76,7 +85,7 @@ class Viewer {
 
   toggle() {
     this.playing = !this.playing;
-    element("play").textContent = this.playing ? "⏸" : "▶";
+    element("play").classList.toggle("playing", this.playing);
     element("play").setAttribute("aria-label", this.playing ? "Pause" : "Play");
     if (!this.playing) return;
     let last = performance.now(), due = 0;
@@ -90,6 +99,12 @@ class Viewer {
       requestAnimationFrame(tick);
     };
     requestAnimationFrame(tick);
+  }
+
+  /** Shows a frame that somebody asked for. */
+  stopAt(frame) {
+    if (this.playing) this.toggle();
+    this.seek(frame);
   }
 
   seek(frame) {
@@ -175,22 +190,33 @@ class Viewer {
     panels.forEach((panel) => this.drawPanel(panel, canvas.height, ratio));
     this.placeLabels(panels);
     this.drawChart();
+    this.showParticle();
     this.drawn += 1;
+    this.onDrawn?.();
   }
 
   drawPanel({ indices, x, y, width, height }, canvasHeight, ratio) {
     const pixels = [x, canvasHeight / ratio - y - height, width, height].map((value) => Math.round(value * ratio));
     const { matrix, unit } = this.camera.view(width, height);
-    const look = { mode: this.mode, top: this.top(), plain: [0, 0, 0, 1], diameter: 1.1 * scene.spacing * unit * ratio };
+    const look = { mode: this.mode, top: this.top(), plain: [0, 0, 0, 1], diameter: DISC_DIAMETER * scene.spacing * unit * ratio };
     const ensemble = indices.includes(this.ensemble?.index) ? this.ensemble : null;
     this.drawing.startPanel(pixels, matrix, this.theme);
     ensemble?.drawBehind(this.frame, matrix);
     this.drawing.drawObstacles(matrix, { ...look, mode: MODES.plain, plain: [...this.theme.ghost, 1] });
+    if (scene.dim === 3) this.drawShadow(indices.at(-1), matrix, look);
     for (const index of indices) {
       const chosen = this.fieldLook(index === 0 ? this.referenceLook(look, indices.length > 1) : look, index);
       if (index === ensemble?.index) ensemble.draw(this.trajectories[0], this.frame, matrix, chosen);
       else this.drawing.drawFrame(this.trajectories[index], this.trajectories[0], this.frame, matrix, chosen);
     }
+  }
+
+  /** On the floor, straight below the particles. */
+  drawShadow(index, matrix, look) {
+    if (this.camera.tilt < 0) return;
+    const shadow = { ...look, mode: MODES.plain, plain: [...this.theme.wall, 1] }, flat = flatten(scene.up, scene.bounds[scene.up][0]);
+    this.drawing.drawFrame(this.trajectories[index], this.trajectories[0], this.frame, multiply(matrix, flat), shadow);
+    this.drawing.gl.clear(this.drawing.gl.DEPTH_BUFFER_BIT);
   }
 
   /** With a trajectory's values of the chosen field; one without the field has the colours of its materials. */
@@ -220,6 +246,7 @@ class Viewer {
       label.textContent = names.length < 2 ? names[0]
         : this.ensemble?.isDensity ? `${names[0]} (dots) over ${names[1]}` : `${names.slice(1).join(", ")} over ${names[0]} (grey)`;
       label.style.left = `${x + width / 2}px`;
+      label.style.maxWidth = `${width - 8}px`;
       label.style.top = `${y - 24}px`;
       if (scene.tilt !== null) label.append(gravityNote(scene.tilt));
       return label;
@@ -241,11 +268,60 @@ class Viewer {
     const [{ label: reference }, ...others] = scene.trajectories;
     const lines = others.map(({ errors }, index) => ({ values: errors, colour: index ? this.theme.faint : this.theme.accent }));
     const now = others.map(({ label, errors }) => `${label}: ${digits(errors[this.frame])} from ${reference}`);
-    return { title: "root mean square error", bands: [], lines, now };
+    return { title: "root mean square position error (length), by frame", bands: [], lines, now };
   }
 
   showLegend() {
     element("legend").replaceChildren(...colourLegend(this), ...(this.ensemble?.legend(this.theme) ?? []));
+  }
+
+  /** Turns or moves while a button is down; else shows the particle that the pointer is at. */
+  follow(event) {
+    this.pointer = event && !event.buttons ? event : null;
+    if (event?.buttons) return this.drag(event);
+    if (!this.playing) this.showParticle();
+  }
+
+  showParticle() {
+    const note = element("particle"), picked = this.pointer && this.pick(this.pointer);
+    note.hidden = !picked;
+    if (!picked) return;
+    const { number, index, x, y } = picked, speed = this.speedOf(this.trajectories[index], number) / scene.dt;
+    note.textContent = `particle ${number}, ${scene.materials[this.materials[number]].name}, ${digits(speed, 3)} length/s`;
+    note.style.transform = `translate(${Math.min(x + 12, element("scene").clientWidth - note.offsetWidth - 4)}px, ${Math.max(y - 30, 0)}px)`;
+  }
+
+  /** The particle at a point of the canvas, in 3-D the nearest to the viewer; null where there is none. */
+  pick({ offsetX, offsetY }) {
+    const panel = this.panelUnder({ offsetX, offsetY }), index = panel.indices.at(-1), { x, y, width, height } = panel;
+    const { matrix: m, unit } = this.camera.view(width, height), positions = this.trajectories[index];
+    let best = null;
+    for (let number = 0; number < positions.length / scene.frames / scene.dim; number++) {
+      const [a, b, c] = inSpace(this.pointOf(positions, this.frame, number));
+      if (Number.isNaN(a)) continue;
+      const [right, up, depth, w] = [0, 1, 2, 3].map((row) => m[row] * a + m[4 + row] * b + m[8 + row] * c + m[12 + row]);
+      const at = [x + (width * (1 + right / w)) / 2, y + (height * (1 - up / w)) / 2];
+      const away = Math.hypot(at[0] - offsetX, at[1] - offsetY), order = scene.dim === 2 ? away : depth / w;
+      if (away < Math.max(6, (DISC_DIAMETER * scene.spacing * unit) / w / 2) && !(best?.order <= order))
+        best = { number, index, order, x: at[0], y: at[1] };
+    }
+    return best;
+  }
+
+  /** A particle's position in domain lengths; NaN where it is not there. */
+  pointOf(positions, frame, number) {
+    const at = (positions.length / scene.frames) * frame + number * scene.dim;
+    return scene.low.map((low, axis) => (positions[at] === 65535 ? NaN : low + ((scene.high[axis] - low) * positions[at + axis]) / 65535));
+  }
+
+  /** The distance that a particle moves to this frame from the one before. */
+  speedOf(positions, number) {
+    const [now, before] = [Math.max(this.frame, Math.min(1, scene.frames - 1)), Math.max(this.frame - 1, 0)];
+    const from = this.pointOf(positions, before, number);
+    return Math.hypot(...this.pointOf(positions, now, number).map((value, axis) => {
+      const moved = value - from[axis], period = scene.period[axis];
+      return period ? moved - period * Math.round(moved / period) : moved;
+    }));
   }
 
   panelUnder(event) {
@@ -275,9 +351,10 @@ async function start() {
   const trajectories = await Promise.all(scene.trajectories.map(readTrajectory));
   const obstacles = undoDifferences(await inflate(scene.obstacles), 1);
   const members = await Promise.all(scene.members.map(readTrajectory));
-  const drawing = new Drawing(element("scene"), await inflate(scene.colours), obstacles);
+  const materials = await inflate(scene.particles), colours = scene.materials.map(({ colour }) => readColour(colour).map((value) => 255 * value));
+  const drawing = new Drawing(element("scene"), Uint8Array.from([...materials].flatMap((index) => colours[index])), obstacles);
   const fields = await Promise.all(scene.fields.map(({ values }) => Promise.all(values.map(readField))));
-  window.viewer = new Viewer(drawing, trajectories, fields, members);
+  window.viewer = new Viewer(drawing, trajectories, fields, members, materials);
   element("message").hidden = true;
 }
 
