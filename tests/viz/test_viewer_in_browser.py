@@ -18,7 +18,7 @@ WATER = (38, 112, 200)
 
 @pytest.fixture
 def open_page(browser, tmp_path):
-    """Writes and opens a page, stopped at its first frame, in the materials' colours; an error it logs fails the test."""
+    """Opens a page, stopped at its first frame, in the materials' colours; fails at the end if it logged an error."""
     context = browser.new_context(viewport={"width": 900, "height": 640})
     errors = []
 

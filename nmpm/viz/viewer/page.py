@@ -98,7 +98,8 @@ class ViewerPage:
 
     def _repr_html_(self) -> str:
         page = html.escape(self.html, quote=True)
-        return f'<iframe srcdoc="{page}" sandbox="allow-scripts allow-downloads" style="width: 100%; height: 640px; border: 0"></iframe>'
+        allowed, style = "allow-scripts allow-downloads", "width: 100%; height: 640px; border: 0"
+        return f'<iframe srcdoc="{page}" sandbox="{allowed}" style="{style}"></iframe>'
 
 
 def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
