@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import multiprocessing
 from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +17,7 @@ from numpy.typing import NDArray
 from nmpm.errors import UnstableError
 from nmpm.play.simulating import Simulated, simulate_for
 from nmpm.scene import Scene
-from nmpm.sim import Preset
+from nmpm.sim import InitialState, Preset
 from nmpm.zoo.fallback import fitting_preset, initial_state
 
 if TYPE_CHECKING:
@@ -34,20 +37,19 @@ class SimulatorBeside:
     def __init__(self, scene: Scene, preset: Preset) -> None:
         self._scene, self._preset, self._due = scene, preset, 0
         self._times: deque[float] = deque(maxlen=_TIMED_FRAMES)
-        context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=simulate_for, args=(theirs,), daemon=True)
-        self._process.start()
-        theirs.close()
-        self._run = 0
+        self._run, self._frame, self._is_warm = 0, 0, False
+        self._process: BaseProcess | None = None
+        self._sender, self._sending = ThreadPoolExecutor(1), Future[None]()
+        self._to_send: tuple[int, Preset, InitialState] | None = None
+        self._sending.set_result(None)
 
     @property
     def frame_seconds(self) -> float:
         """Median time of the last frames; 0 before the first."""
         return sorted(self._times)[len(self._times) // 2] if self._times else 0.0
 
-    def start(self, world: World) -> None:
-        """Start anew from what is shown, at rest density and without strain.
+    def start(self, world: World, frame: int) -> None:
+        """Start anew from what is shown, a frame of the emulator's, at rest density and without strain.
 
         Raises:
             ConfigError: if the simulator has no such obstacles.
@@ -61,37 +63,71 @@ class SimulatorBeside:
         preset = fitting_preset(self._scene, state, self._preset)
         start, self._order = initial_state(self._scene, state, preset)
         self._there, self._count = state.mask[0].nonzero()[:, 0].numpy(), world.count
-        self._run, self._due = self._run + 1, 0
-        self._pipe.send((self._run, preset, start))
+        self._run, self._due, self._frame = self._run + 1, 0, frame
+        self._to_send = self._run, preset, start
+        if self._process is None:
+            self._open()
+        self._keep_sending()
 
-    def advance(self, frames: int) -> tuple[int, NDArray[np.float32]] | None:
-        """The last frame that is there, of those that may be shown now, and its positions (N, D); None for no new one.
+    def _open(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=simulate_for, args=(theirs,), daemon=True)
+        self._process.start()
+        theirs.close()
+
+    def _keep_sending(self) -> None:
+        """Send the last start by a thread of its own, as the pipe may be full both ways."""
+        if self._to_send is not None and self._sending.done():
+            self._sending = self._sender.submit(self._send)
+
+    def _send(self) -> None:
+        with suppress(OSError):  # the process has ended, which `advance` says
+            while self._to_send is not None:
+                start, self._to_send = self._to_send, None
+                self._pipe.send(start)
+
+    def advance(self, world: World, frame: int, frames: int) -> tuple[int, NDArray[np.float32]] | None:
+        """Up to so many frames more, as far as they are there: the last one's number and positions (N, D), or None.
+
+        What is shown, a frame of the emulator's, is started from once the process is ready: both begin together.
 
         Raises:
+            ConfigError: as `start`.
             UnstableError: if the simulation has become unstable, or its process has ended.
         """
-        self._due += frames
-        shown = None
+        self._keep_sending()
+        self._due, shown = self._due + frames, None
         while self._due > 0 and self._pipe.poll():
-            try:
-                made: Simulated = self._pipe.recv()
-            except (EOFError, OSError) as error:
-                raise UnstableError("the simulator's process has ended") from error
+            made = self._receive()
             if made.run != self._run:
                 continue
             if made.problem:
                 raise UnstableError(f"the simulator: {made.problem}")
+            if not self._is_warm:
+                self._is_warm = True
+                self.start(world, frame)
+                return None
             self._due -= 1
             self._times.append(made.seconds)
-            shown = made.frame, self._in_order(made.position)
+            shown = self._frame + made.frame, self._in_order(made.position)
         self._due = min(self._due, frames)
         return shown
 
+    def _receive(self) -> Simulated:
+        try:
+            made: Simulated = self._pipe.recv()
+        except (EOFError, OSError) as error:
+            raise UnstableError("the simulator's process has ended") from error
+        return made
+
     def close(self) -> None:
         """End the process."""
-        self._pipe.close()
-        self._process.terminate()
-        self._process.join()
+        if self._process is not None:
+            self._process.terminate()
+            self._process.join()
+            self._sender.shutdown()
+            self._pipe.close()
 
     def _in_order(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
         """Simulated positions in the order of the emulator's particles."""

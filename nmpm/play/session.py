@@ -45,6 +45,8 @@ LARGEST_SEED = 2**31 - 1
 AHEAD = 4
 """Pictures that may be on their way: a page that draws fewer than 60 a second, or is hidden, slows the session."""
 _STATUS_TICKS = 15
+_ROWS = 2
+"""Of particles that are poured at once."""
 _LEAST_POUR = 0.5
 """Rows of what is poured slowly follow each other every so many frames: share of a spacing that counts in a frame."""
 
@@ -215,7 +217,7 @@ class Session:
             if self._preset is None:
                 raise ConfigError("no simulator is known for this model's scenes")
             beside = SimulatorBeside(self.scene, self._preset)
-            beside.start(self.world)
+            beside.start(self.world, self.frame)
             self._beside = beside
 
     def save(self) -> None:
@@ -260,19 +262,26 @@ class Session:
     def _advance(self) -> None:
         """The next frame, with what is poured until there."""
         if self._pour is not None:
-            self._pour_row(self._pour)
+            self._pour_rows(self._pour)
         self.world.advance()
         self.frame += 1
         self.recording.add(self.world.position, self.world.bodies)
 
-    def _pour_row(self, pour: Pour) -> None:
-        spacing = self.scene.particle_spacing
-        self._poured += max(math.hypot(*pour.velocity) * self.scene.dt, _LEAST_POUR * spacing)
-        if self._poured < spacing:
+    def _pour_rows(self, pour: Pour) -> None:
+        """Pour some rows at once, one behind the other: each time costs a call."""
+        spacing, length = self.scene.particle_spacing, _ROWS * self.scene.particle_spacing
+        speed = math.hypot(*pour.velocity)
+        self._poured += max(speed * self.scene.dt, _LEAST_POUR * spacing)
+        if self._poured < length:
             return
         self._poured = 0.0
+        ahead = [
+            [x + number * spacing * v / speed for x, v in zip(pour.at, pour.velocity, strict=True)]
+            for number in range(_ROWS)
+        ]
+        rows = torch.cat([row(at, pour.velocity, pour.width, spacing) for at in ahead])
         try:
-            self._add(row(pour.at, pour.velocity, pour.width, spacing), pour.velocity, pour.material)
+            self._add(rows, pour.velocity, pour.material)
         except ConfigError as error:
             self._pour = None
             self.say(str(error))
@@ -307,7 +316,7 @@ class Session:
         beside = self._beside
         try:
             if beside is not None:
-                beside.start(self.world)
+                beside.start(self.world, self.frame)
         except NmpmError as error:
             self.set_beside(False)
             self.say(one_line(error, 300))
@@ -328,7 +337,8 @@ class Session:
         """The picture of the simulator beside, as far as it has come."""
         beside = self._beside
         try:
-            shown = beside.advance(self.pace if self.playing else 0) if beside is not None else None
+            frames = self.pace if self.playing else 0
+            shown = beside.advance(self.world, self.frame, frames) if beside is not None else None
         except NmpmError as error:
             self.set_beside(False)
             self.say(one_line(error, 300))

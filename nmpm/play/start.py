@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -50,13 +51,15 @@ def start_of(model: Pretrained, seed: int) -> Start:
     bodies = tuple(Ramp(ramp.centre, ramp.length, ramp.thickness, ramp.angle) for ramp in ramps)
     static = None if bodies and len(ramps) == len(drawn.obstacles) else _static_particles(preset, seed)
     names = np.repeat(preset.scene.materials, drawn.counts_of(len(preset.scene.materials)))
-    particles = model.state(
-        drawn.position,
-        drawn.velocity,
-        names,
-        obstacle=static if model.scene.obstacles else None,
-        gravity=drawn.gravity if model.scene.gravity_varies else None,
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # (such starts are those of the training)
+        particles = model.state(
+            drawn.position,
+            drawn.velocity,
+            names,
+            obstacle=static if model.scene.obstacles else None,
+            gravity=drawn.gravity if model.scene.gravity_varies else None,
+        )
     return Start(particles, bodies)
 
 

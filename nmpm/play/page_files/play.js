@@ -108,16 +108,18 @@ class Play {
   }
 
   placeLabels() {
-    const names = [scene.model, scene.simulator], frames = this.stage.films.map(({ frame }) => frame);
-    const labels = this.stage.panels().map(({ x, y, width }, index) => {
+    const [now, simulated] = this.stage.films.map(({ frame }) => frame), behind = now - simulated;
+    const texts = [
+      [scene.model, `frame ${now}, ${(now * scene.dt).toFixed(2)} s`],
+      [scene.simulator, simulated ? `frame ${simulated}${behind > 0 ? `, ${behind} behind` : ""}` : "is starting …"],
+    ];
+    element("labels").replaceChildren(...this.stage.panels().map(({ x, y, width }, index) => {
       const label = document.createElement("span"), time = document.createElement("small");
-      label.textContent = names[index];
-      time.textContent = this.stage.beside && index === 1 ? `frame ${frames[1]} since it began` : `frame ${frames[0]}, ${(frames[0] * scene.dt).toFixed(2)} s`;
+      [label.textContent, time.textContent] = texts[index];
       Object.assign(label.style, { left: `${x + width / 2}px`, top: `${y - 24}px` });
       label.append(time);
       return label;
-    });
-    element("labels").replaceChildren(...labels);
+    }));
   }
 
   // The controls.
