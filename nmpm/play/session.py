@@ -27,7 +27,7 @@ from nmpm.play.messages import read_command
 from nmpm.play.placing import block, row, with_room
 from nmpm.play.pushing import Movable, moved, push
 from nmpm.play.recording import Recording
-from nmpm.play.start import playable_preset, start_of
+from nmpm.play.start import simulator_of, start_of
 from nmpm.play.world import World
 from nmpm.zoo.states import StateBuilder
 
@@ -65,7 +65,7 @@ class Session:
         room = int(_FILLED * self.scene.volume / self.scene.particle_volume)
         self.most_particles = min(MOST_PARTICLES, room)
         self.playing, self.pace = True, 1
-        self._preset = playable_preset(model)
+        self._preset = simulator_of(model)
         self._beside: SimulatorBeside | None = None
         self._fastest = _fastest(model)
         self._pour: Pour | None = None

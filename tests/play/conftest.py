@@ -49,13 +49,17 @@ class Player:
         for _ in range(count):
             self.take(self.session.tick())
 
+    def positions(self, kind):
+        """(N, D) of the pictures of a kind by frame, in domain length; NaN where a particle is not there."""
+        scene = self.texts["scene"]
+        low, high = np.array(scene["low"]), np.array(scene["high"])
+        shown = {m[1]: np.frombuffer(m[2], "<u2").reshape(-1, scene["dim"]) for m in self.sent if m[0] == kind}
+        return {at: np.where(steps == 65535, np.nan, low + (high - low) * steps / 65535) for at, steps in shown.items()}
+
     @property
     def position(self):
-        """(N, D) of the last picture of the emulator, in domain length; NaN where a particle is not there."""
-        data, scene = next(m[2] for m in reversed(self.sent) if m[0] == pictures.EMULATOR), self.texts["scene"]
-        steps = np.frombuffer(data, "<u2").reshape(-1, scene["dim"])
-        low, high = np.array(scene["low"]), np.array(scene["high"])
-        return np.where(steps == 65535, np.nan, low + (high - low) * steps / 65535)
+        """(N, D) of the last picture of the emulator."""
+        return list(self.positions(pictures.EMULATOR).values())[-1]
 
 
 @pytest.fixture
