@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,14 +15,12 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
-from nmpm._support.progress import progress_bar
-from nmpm.cli.prediction import kept_frames, milliseconds, predicted
+from nmpm.cli.prediction import milliseconds, on_device, predicted, timed_parts
 from nmpm.cli.recorded_start import compared, recorded_errors
 from nmpm.data.described import described_metadata
 from nmpm.data.format import MEMBER, Trajectory
 from nmpm.data.write import find_writer, write_trajectories
 from nmpm.emulator import Prescribed, Rollout
-from nmpm.emulator.input_checks import warn_of_start_outside
 from nmpm.emulator.members import member_starts
 from nmpm.emulator.monitor import Monitor, Policy
 from nmpm.emulator.trust import TrustTracker, stream_watched
@@ -75,19 +72,14 @@ class MemberRollouts:
     def _predict(self, frames: MemberFrames) -> None:
         """Predict all frames of all members, and print what they cost."""
         emulator, members = self.model.emulator, self.options.members
-        state, given = self.state.to(emulator.device), self.prescribed and self.prescribed.to(emulator.device)
-        warn_of_start_outside(emulator, state)
+        state, given = on_device(self.model, self.state, self.prescribed)
         monitor, steps = Monitor(Policy(self.options.watch)), self.frames * self.between
-        tracker = TrustTracker(emulator.scene, state, self.model.trust)
+        tracker, times = TrustTracker(emulator.scene, state, self.model.trust), list[float]()
         stream = stream_watched(
             emulator, state, steps, tracker, members, self.options.seed, self._nudge, given, monitor
         )
-        times = [time.perf_counter()]
-        with progress_bar(f"{members} members", -(-steps // emulator.frames)) as step:
-            for part in kept_frames(stream, self.between):
-                times.append(time.perf_counter())
-                frames.add(part)
-                step()
+        for part in timed_parts(self.model, f"{members} members", stream, steps, self.between, times):
+            frames.add(part)
         cost = milliseconds(times, emulator.frames / self.between * members)
         sys.stdout.write(f"{members} members, {cost:.3g} ms per frame and member: {monitor.report()}\n")
 

@@ -56,16 +56,34 @@ def timed_rollout(
         prescribed: What moves or enters as recorded.
         between: Frames that the model makes for each of these; all but every last of them are left out.
     """
-    parts, steps = [], frames * between
-    start, given = state.to(model.emulator.device), prescribed and prescribed.to(model.emulator.device)
-    warn_of_start_outside(model.emulator, start)
-    times = [time.perf_counter()]
-    with progress_bar("rollout", -(-steps // model.emulator.frames)) as step:
-        for part in kept_frames(stream_rollout(model.emulator, start, steps, monitor, given), between):
-            times.append(time.perf_counter())
-            parts.append(part)
-            step()
+    start, given = on_device(model, state, prescribed)
+    stream, times = stream_rollout(model.emulator, start, frames * between, monitor, given), list[float]()
+    parts = list(timed_parts(model, "rollout", stream, frames * between, between, times))
     return Rollout.join(parts), milliseconds(times, model.emulator.frames / between)
+
+
+def on_device(
+    model: Pretrained, state: Particles, prescribed: Prescribed | None
+) -> tuple[Particles, Prescribed | None]:
+    """What a rollout starts from, where the model computes; warns of particles outside of the bounds."""
+    start = state.to(model.emulator.device)
+    warn_of_start_outside(model.emulator, start)
+    return start, prescribed and prescribed.to(model.emulator.device)
+
+
+def timed_parts(
+    model: Pretrained, what: str, stream: Iterable[Rollout], steps: int, between: int, times: list[float]
+) -> Iterator[Rollout]:
+    """The `kept_frames` of a rollout of so many steps, with a progress bar.
+
+    Adds the time in seconds at the start, and after each bundle, to `times`.
+    """
+    times.append(time.perf_counter())
+    with progress_bar(what, -(-steps // model.emulator.frames)) as step:
+        for part in kept_frames(stream, between):
+            times.append(time.perf_counter())
+            yield part
+            step()
 
 
 def milliseconds(times: Sequence[float], frames: float) -> float:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
 
 from nmpm._support.progress import progress_bar
-from nmpm.cli.prediction import kept_frames
+from nmpm.cli.prediction import on_device, timed_parts
 from nmpm.emulator import Prescribed, Rollout
-from nmpm.emulator.input_checks import warn_of_start_outside
 from nmpm.emulator.monitor import Monitor, Policy
 from nmpm.emulator.trust import TrustTracker, stream_watched, until_trusted
 from nmpm.errors import ConfigError
@@ -41,11 +39,11 @@ def predict_trusted(
         ConfigError: if the fallback does not fit, or no frame is trusted and there is none.
     """
     preset = _fallback(model, state, prescribed, options, between)
-    start, given = state.to(model.emulator.device), prescribed and prescribed.to(model.emulator.device)
-    warn_of_start_outside(model.emulator, start)
+    start, given = on_device(model, state, prescribed)
     tracker, monitor = TrustTracker(model.scene, start, model.trust), Monitor(Policy(options.watch))
     watched = stream_watched(model.emulator, start, frames * between, tracker, prescribed=given, monitor=monitor)
-    trusted = _join(model, kept_frames(until_trusted(watched, tracker), between), frames * between)
+    parts = until_trusted(watched, tracker)
+    trusted = Rollout.join(list(timed_parts(model, "rollout", parts, frames * between, between, [])))
     sys.stdout.write(f"{monitor.report()}\n")
     if preset is not None:
         return _simulate_rest(model, state, trusted._replace(trusted=tracker.frames), preset, frames)
@@ -66,15 +64,6 @@ def _fallback(
             + ("these data prescribe motion." if prescribed is not None else "--stride asks for others.")
         )
     return fitting_preset(model.scene, state, load_preset(options.fallback))
-
-
-def _join(model: Pretrained, parts: Iterator[Rollout], steps: int) -> Rollout:
-    joined = []
-    with progress_bar("rollout", -(-steps // model.emulator.frames)) as step:
-        for part in parts:
-            joined.append(part)
-            step()
-    return Rollout.join(joined)
 
 
 def _simulate_rest(model: Pretrained, state: Particles, trusted: Rollout, preset: Preset, frames: int) -> Rollout:

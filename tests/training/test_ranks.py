@@ -48,6 +48,7 @@ def two(folder, tmp_path_factory) -> dict[str, list[dict]]:
     runs = {
         "all": {"max_steps": 14, "data": {"batch_size": 2, "emphasis": 0.5}, "average": True},
         "soap": {"max_steps": 24, "data": {"batch_size": 2}, "soap": True},
+        "members": {"max_steps": 4, "data": {"batch_size": 2}, "model": {"members": 2}},
         "begun": {"max_steps": 6, "data": HALF},
         "resumed": {"max_steps": 10, "data": HALF, "ckpt_path": str(root / "alone.ckpt")},
         "accumulated": {"max_steps": 7, "accumulate_grad_batches": 2, "data": HALF},
@@ -96,10 +97,12 @@ def test_two_processes_have_the_loss_curve_of_one_with_twice_the_batch(folder, t
         assert record["seeds"] == one["seeds"]
     soap = train(folder, tmp_path / "soap.ckpt", max_steps=24, soap=True)
     assert two["soap"][0]["losses"] == pytest.approx(soap["losses"], rel=1e-3)
+    members = train(folder, tmp_path / "members.ckpt", max_steps=4, model={"members": 2})
+    assert two["members"][0]["losses"] == pytest.approx(members["losses"], rel=1e-5)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["all", "clock", "accumulated", "soap"])
+@pytest.mark.parametrize("name", ["all", "clock", "accumulated", "soap", "members"])
 def test_processes_stay_together(two, name):
     one, other = two[name]
     for key in ("weights", "rates", "losses"):

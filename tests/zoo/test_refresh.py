@@ -9,6 +9,7 @@ import yaml
 from nmpm._support.bounded_files import read_yaml
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
+from nmpm.emulator import members
 from nmpm.errors import ConfigError, UnstableError, ZooError
 from nmpm.evaluation.stress import QUICK, results
 from nmpm.sim import load_preset
@@ -86,6 +87,12 @@ def test_scores_of_members_are_on_the_card_and_confirmed(goop):
     checks = [check for check in verify_entry(goop, full=True) if "CRPS" in check.name]
     assert len(checks) == 4
     assert all(check.passed for check in checks)
+
+
+def test_members_are_scored_where_data_have_no_validation_scenes(entry, make_dataset):
+    folder = make_dataset(test=((12, 9),), valid=())
+    refresh(entry, ["ensemble"], data=folder)
+    assert Zoo.card("small", entry.parent)["ensemble"]["nudge"] == members.NUDGE
 
 
 def nudge_all_but(stable: set[int]):

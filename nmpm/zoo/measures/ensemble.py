@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from nmpm.data.split_files import split_paths
 from nmpm.emulator import Prescribed
 from nmpm.evaluation.ensembles import EnsembleTest
 from nmpm.particles import Window
@@ -31,14 +32,11 @@ def ensemble_facts(model: Pretrained, data: Path | None) -> dict[str, Any]:
 
 def calibrate_nudge(model: Pretrained, data: Path | None) -> float | None:
     """The displacement in cells with the lowest fair CRPS of density; None without validation scenes."""
-    scenes = list(iterate_scenes(f"nudges of {model.name}", model, data, VALID_SCENES, split="valid"))
-    if not scenes:
+    if data is not None and "valid" not in split_paths(data):
         return None
-    crps = {}
-    for nudge in NUDGES:
-        scores = score_members(model, scenes, MEMBERS, nudge).to_dict()["scores"]
-        crps[nudge] = sum(values["crps"] for name, values in scores.items() if name.startswith("density"))
-    return min(NUDGES, key=lambda nudge: crps[nudge])
+    scenes = list(iterate_scenes(f"nudges of {model.name}", model, data, VALID_SCENES, split="valid"))
+    crps = {nudge: score_members(model, scenes, MEMBERS, nudge).overall_score() for nudge in NUDGES if scenes}
+    return min(crps, key=lambda nudge: crps[nudge], default=None)
 
 
 def score_members(
