@@ -75,11 +75,17 @@ def with_noise(emulator: Emulator, processor: Stochastic | None = None) -> Emula
         kind = type(emulator.recipe.processor).__name__
         raise ConfigError(f"{kind} names no channel_layers, so that noise cannot be added to trained weights.")
     other = _built_like(emulator, dataclasses.replace(emulator.recipe, processor=processor))
-    state, prefix = emulator.state_dict(), "processor."
-    before = {name.removeprefix(prefix): values for name, values in state.items() if name.startswith(prefix)}
-    weights = processor.weights(before, layers, len(emulator.scene.input_channels))
-    kept = {name: values for name, values in state.items() if not name.startswith(prefix)}
-    other.load_state_dict(kept | {f"{prefix}{name}": values for name, values in weights.items()})
+    inputs, outputs = len(emulator.scene.input_channels), len(emulator.scene.output_channels)
+    change = ChannelChange(
+        layers,
+        GridLayout(inputs, outputs, emulator.frames, emulator.scene.periodic),
+        [*range(inputs), *[None] * other.processor.noise],
+        [OutputSource(channel) for channel in range(outputs)],
+        emulator.input_mean,
+    )
+    weights = change.weights(emulator.processor.state_dict())
+    kept = {name: values for name, values in emulator.state_dict().items() if not name.startswith("processor.")}
+    other.load_state_dict(kept | {f"processor.network.{name}": values for name, values in weights.items()})
     return _with_mode_of(emulator, other)
 
 

@@ -100,14 +100,8 @@ class Trust:
 
 
 def _frames(curves: Sequence[Tensor], limit: float) -> Tensor:
-    """(S,) the last frame of each curve below a limit, at least 1."""
-    return torch.tensor([max(1, frames_below(curve, limit)) for curve in curves], dtype=torch.float64)
-
-
-def frames_below(curve: Tensor, limit: float) -> int:
-    """How many frames of a curve (T,) come before the first that is beyond a limit."""
-    beyond = (curve > limit).nonzero()
-    return int(beyond[0]) if len(beyond) else len(curve)
+    """(S,) how many frames of each curve (T,) come before the first that is beyond a limit, at least 1."""
+    return torch.tensor([max(1, int((curve <= limit).cumprod(0).sum())) for curve in curves], dtype=torch.float64)
 
 
 class TrustTracker:
@@ -234,17 +228,13 @@ def until_trusted(parts: Iterator[Rollout], tracker: TrustTracker) -> Iterator[R
         kept = int(tracker.frames.max()) - made
         index = torch.arange(made + 1, tracker.made + 1)
         there = (index <= tracker.frames[:, None]).repeat(len(part.position) // len(tracker.frames), 1)
-        yield _masked(part, there.to(part.position.device), kept)
+        there = there.to(part.position.device)[..., None]
+        position = part.position.where(there[..., None], torch.nan)[:, :kept]
+        fields = {name: values.where(there, torch.nan)[:, :kept] for name, values in part.fields.items()}
+        yield Rollout(position, fields)
         made = tracker.made
         if kept < len(index):
             return
-
-
-def _masked(part: Rollout, there: Tensor, kept: int) -> Rollout:
-    """The first frames of a part, NaN where `there` (rows, T) is False."""
-    position = torch.where(there[:, :, None, None], part.position, torch.nan)[:, :kept]
-    fields = {name: torch.where(there[..., None], values, torch.nan)[:, :kept] for name, values in part.fields.items()}
-    return Rollout(position, fields)
 
 
 def calibrate(emulator: Emulator, windows: Iterable[Window]) -> Trust:

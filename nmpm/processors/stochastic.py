@@ -12,7 +12,6 @@ Skillful joint probabilistic weather forecasting from marginals, arXiv 2506.1077
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -56,20 +55,6 @@ class Stochastic(Processor):
         channels = layout.in_channels + self.fine + self.coarse
         network = self.processor.build(dataclasses.replace(layout, in_channels=channels))
         return StochasticNetwork(self, network, layout.in_channels)
-
-    def weights(self, before: Mapping[str, Tensor], layers: ChannelLayers, channels: int) -> dict[str, Tensor]:
-        """The weights by name of the network that reads noise, from those of the one that does not; its output stays.
-
-        Args:
-            before: Of the network without noise.
-            layers: Of that.
-            channels: C_in, those of the grid state.
-        """
-        first = f"{layers.first}.weight"
-        reads, more = before[first].tensor_split([channels * layers.cells], dim=1)
-        silent = reads.new_zeros(reads.shape[0], (self.fine + self.coarse) * layers.cells, *reads.shape[2:])
-        widened = {**before, first: torch.cat([reads, silent, more], dim=1)}
-        return {f"network.{name}": values for name, values in widened.items()}
 
     def check_grid(self, grid: Grid) -> None:
         self.processor.check_grid(grid)
