@@ -27,6 +27,7 @@ from nmpm.evaluation.figures import (
 )
 from nmpm.zoo.card import FACTOR, fastest_time, lifecycle, stated_milliseconds, trivial_error
 from nmpm.zoo.entries import CONFIG, read_card, read_recipe
+from nmpm.zoo.speed_table import speed_tables
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -169,37 +170,41 @@ def _stress(digest: Mapping[str, Any] | None) -> str:
 
 def index_page(root: Path, names: Sequence[str]) -> str:
     """The page of a zoo's models, as Markdown; entries with a damaged card are left out."""
-    entries = []
+    entries, cards = [], {}
     for name in names:
         try:
             card, recipe = read_card(root / name), read_recipe(read_yaml(root / name / CONFIG))
             with complete_card(name):
-                entries.append((name, lifecycle(card), _figure_cells(card), _scene_cells(card, recipe)))
+                entries.append(
+                    (name, lifecycle(card), _figure_cells(card), _plain_times(card), _scene_cells(card, recipe))
+                )
+                cards[name] = card
         except (ZooError, DataError):
             continue
     picture = TRADE if (root / TRADE).is_file() else None
-    return _TEMPLATES.get_template("index.md").render(entries=entries, factor=f"{FACTOR:g}", picture=picture)
+    return _TEMPLATES.get_template("index.md").render(
+        entries=entries,
+        hardware=sorted({name for _, _, _, times, _ in entries for name in times}),
+        speed_ups=speed_tables(cards),
+        factor=f"{FACTOR:g}",
+        picture=picture,
+        digits=lambda value: f"{value:.2g}",
+    )
 
 
 def _figure_cells(card: Mapping[str, Any]) -> list[str]:
-    """Errors, times, speed-up and hours of training."""
-    test, twin, trade = card["test"], card.get("twin"), card.get("trade") or {}
+    """Errors, and hours of training."""
+    test, twin = card["test"], card.get("twin")
     low, high = (card.get("interval") or {}).get("mse", (None, None))
     between = "" if low is None else f" ({_thousandths(low)} – {_thousandths(high)})"
     simulator = "" if twin is None else _thousandths(twin["mse"])
     if twin is not None and abs(twin["substeps"] - twin["own_substeps"] / 2) > 0.5:
         simulator += f" ({twin['substeps']} of {twin['own_substeps']})"
-    plain = stated_milliseconds(card)
-    plain |= {time["hardware"]: time["ms_per_frame"] for time in trade.get("times", []) if time["runtime"] == PLAIN}
-    fastest = fastest_time(card)
     return [
         _thousandths(test.get("mse@100")),
         _thousandths(test["mse"]) + between,
         simulator,
         _thousandths(trivial_error(card)),
-        "; ".join(_time(time, hardware) for hardware, time in plain.items()),
-        "" if fastest is None else _time(fastest["ms_per_frame"], f"{fastest['runtime']}, {fastest['hardware']}"),
-        _ratio(trade["speed_up"]) if "speed_up" in trade else "",
         f"{card['training']['seconds'] / 3600:.1f} h",
     ]
 
@@ -212,8 +217,11 @@ def _ratio(value: float) -> str:
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 
 
-def _time(milliseconds: float, where: str) -> str:
-    return f"{milliseconds:.2g} ({where.removesuffix(', 1 thread')})"
+def _plain_times(card: Mapping[str, Any]) -> dict[str, float]:
+    """Milliseconds per frame by hardware, of the model as `Zoo.load` gives it."""
+    measured = (card.get("trade") or {}).get("times", [])
+    plain = {time["hardware"]: time["ms_per_frame"] for time in measured if time["runtime"] == PLAIN}
+    return {**stated_milliseconds(card), **plain}
 
 
 def _scene_cells(card: Mapping[str, Any], recipe: EmulatorRecipe) -> list[str]:

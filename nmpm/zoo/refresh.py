@@ -23,6 +23,7 @@ from nmpm.zoo.measures.speed import speed_facts
 from nmpm.zoo.pages import CHART, complete_card, draw_chart, entry_page, index_page
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.registry import Zoo
+from nmpm.zoo.speed_table import BETWEEN, replace_table
 
 MEASURES: Mapping[str, Callable[[Pretrained, Path, Path | None], dict[str, Any]]] = MappingProxyType(
     {
@@ -117,8 +118,11 @@ def write_card(folder: Path, card: Mapping[str, Any]) -> None:
 
 
 def write_index(root: Path) -> Path:
-    """Write the page of a zoo's models, `README.md` in its folder."""
-    _write(root / "README.md", index_page(root, Zoo.list(root)))
+    """Write the page of a zoo's models, `README.md` in its folder, and the table of speed-ups in the one beside it."""
+    names, beside = Zoo.list(root), root.parent / "README.md"
+    _write(root / "README.md", index_page(root, names))
+    if beside.is_file() and BETWEEN.search(text := beside.read_text(encoding="utf-8")):
+        _write(beside, replace_table(text, {name: Zoo.card(name, root) for name in names}, f"{root.name}/"))
     return root / "README.md"
 
 

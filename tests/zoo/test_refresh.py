@@ -21,6 +21,7 @@ from nmpm.zoo.measures import simulator
 from nmpm.zoo.measures.simulator import NUDGE, floor_facts, twin_facts
 from nmpm.zoo.pages import entry_page, index_page
 from nmpm.zoo.refresh import add_facts, refresh
+from nmpm.zoo.speed_table import replace_table
 from nmpm.zoo.verification import verify_entry
 
 SHIPPED = shipped_folder("zoo")
@@ -240,7 +241,7 @@ def test_the_table_of_a_zoo_names_every_model_whose_card_can_be_read(entry, smal
     (entry / "errors.csv").write_text("frame,model,still,free_fall\n1,0.1,0.2,0.3\n2,0.2,0.3,0.4\n")
     assert main(["zoo", "refresh", "small", "--root", str(entry.parent)]) == 0
     text = (entry.parent / "README.md").read_text()
-    assert "| [small](small/README.md) | 10 | 100 (50 – 150) |  | 1000 |  |  |  | 2.0 h |" in text
+    assert "| [small](small/README.md) | 10 | 100 (50 – 150) |  | 1000 | 2.0 h |" in text
     assert "odd" not in text
     assert "broken" not in text
     assert "![errors over frames and over training](chart.png)" in (entry / "README.md").read_text()
@@ -259,8 +260,11 @@ def test_shipped_cards_are_short_and_their_pages_are_made_of_them(name):
 def test_the_page_of_the_shipped_zoo_is_made_of_its_cards():
     page = (SHIPPED / "README.md").read_text()
     assert page == index_page(SHIPPED, Zoo.list(SHIPPED))
-    assert "| 0.14 (openvino bfloat16, Intel(R) Xeon(R) Processor) | 4.9 | 5.0 h |" in page
+    assert "| [goop](goop/README.md) | 1,713 particles, MPM | 0.69 | 0.33 – 0.14 | 2.1 – 4.9 |" in page
     assert "(../benchmarks/trade/goop/trade.png)" in page
+    first = (SHIPPED.parent / "README.md").read_text()
+    assert "| [dambreak2d](zoo/dambreak2d/README.md) | 5,000 particles, SPH | 52 | 1.4 – 0.90 | 37 – 57 |" in first
+    assert replace_table(first, {name: Zoo.card(name, SHIPPED) for name in Zoo.list(SHIPPED)}, "zoo/") == first
     assert len([word for line in page.splitlines() if not line.startswith("|") for word in line.split()]) < 400
 
 

@@ -1,0 +1,103 @@
+"""Draw the README's film: scenes by the simulator, and below them by the zoo's models, with the time of a frame.
+
+nmpm demo dambreak2d --frames 400 --seed 1 --no-open --out dambreak2d
+nmpm demo waterramps --frames 400 --seed 1 --no-open --out waterramps
+python benchmarks/film.py docs/film.gif dambreak2d.h5 waterramps.h5
+
+Files are named after their models. The times are not those of the demonstrations, but the ones that `nmpm trade`
+measured on a machine that did nothing else: of the model as `Zoo.load` gives it, and of its data's simulator.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+from timing import make_parser
+
+from nmpm._support.colours import BACKGROUND, FAINT_TEXT, OBSTACLE, TEXT, Rgb, material_colours
+from nmpm.data.format import Split
+from nmpm.viz.animation import _write_gif
+from nmpm.viz.files import read_labelled
+from nmpm.viz.panel import PanelRenderer
+
+FONTS = Path(mpl.get_data_path()) / "fonts" / "ttf"
+FONT, BOLD = (ImageFont.truetype(FONTS / name, 14) for name in ("DejaVuSans.ttf", "DejaVuSans-Bold.ttf"))
+MARGIN, TITLE, HEADER = 10, 26, 24
+
+
+class Column:
+    """A scene: the simulator above the model, in panels of one height."""
+
+    def __init__(self, file: Path, height: int) -> None:
+        trajectories = read_labelled(Split(file))
+        (left, right), (bottom, top) = trajectories.outer_bounds
+        self.panel = PanelRenderer(trajectories, round(height * (right - left) / (top - bottom)))
+        self.positions = tuple(trajectories.positions.values())
+        self.name = file.stem
+        self.milliseconds = [_milliseconds(file.stem, kind) for kind in ("simulator", "model")]
+
+    def draw(self, image: Image.Image, left: int, frame: int) -> None:
+        """Draws the column with its texts, from this pixel on."""
+        draw, right = ImageDraw.Draw(image), left + self.panel.width
+        draw.text((left, TITLE - 8), self.name, TEXT, BOLD, anchor="ls")
+        draw.text((right, TITLE - 8), f"{self.positions[0].shape[1]:,} particles", FAINT_TEXT, FONT, anchor="rs")
+        for row, label in enumerate(("simulator", "model")):
+            top = TITLE + HEADER + row * (HEADER + self.panel.height)
+            draw.text((left, top - 7), label, TEXT, FONT, anchor="ls")
+            draw.text((right, top - 7), f"{self.milliseconds[row]:.2g} ms per frame", FAINT_TEXT, FONT, anchor="rs")
+            image.paste(Image.fromarray(self.panel.draw(self.positions[row][frame])), (left, top))
+
+
+@dataclass(frozen=True)
+class Film:
+    """Columns side by side, drawn as `FrameRenderer` draws trajectories."""
+
+    columns: Sequence[Column]
+
+    @property
+    def colours(self) -> list[Rgb]:
+        """Those that the palette keeps."""
+        materials = [name for column in self.columns for name in column.panel.trajectories.materials]
+        return [*material_colours(tuple(dict.fromkeys(materials))).values(), OBSTACLE]
+
+    def draw(self, frame: int) -> NDArray[np.uint8]:
+        """One frame, (height, width, 3)."""
+        width = MARGIN + sum(column.panel.width + MARGIN for column in self.columns)
+        height = TITLE + 2 * (HEADER + self.columns[0].panel.height) + MARGIN
+        image, left = Image.new("RGB", (width, height), BACKGROUND), MARGIN
+        for column in self.columns:
+            column.draw(image, left, frame)
+            left += column.panel.width + MARGIN
+        return np.asarray(image)
+
+
+def main() -> None:
+    """Draw rollouts that have the truth beside them."""
+    parser = make_parser(__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("files", nargs="+", type=Path)
+    parser.add_argument("--height", type=int, default=210, help="of a panel, in pixels")
+    parser.add_argument("--frames", type=int, default=60, help="frames of the film")
+    options = parser.parse_args()
+    film = Film([Column(file, options.height) for file in options.files])
+    last = min(len(column.positions[0]) for column in film.columns) - 1
+    _write_gif(film, np.linspace(0, last, options.frames).astype(int).tolist(), 12.5, options.out)
+    sys.stdout.write(f"wrote {options.out}: {options.out.stat().st_size / 1e6:.2f} MB\n")
+
+
+def _milliseconds(name: str, kind: str) -> float:
+    """Of a frame by the first of a kind in a table of `nmpm trade`."""
+    with (Path(__file__).parent / "trade" / name / "trade.csv").open(encoding="utf-8") as file:
+        return next(float(row["ms_per_frame"]) for row in csv.DictReader(file) if row["kind"] == kind)
+
+
+if __name__ == "__main__":
+    main()
