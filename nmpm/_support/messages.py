@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 
 
@@ -21,3 +23,17 @@ def suggestion(name: str, known: Iterable[str]) -> str:
     """The sentence "Did you mean …?" after a space, with the nearest known names; empty if none is near."""
     near = get_close_matches(name, list(known), n=3)
     return f" Did you mean {' or '.join(near)}?" if near else ""
+
+
+@contextmanager
+def plain_warnings() -> Iterator[None]:
+    """Show warnings as a line each, without the file and the line of code that they come from.
+
+    Lightning replaces how warnings are shown when it is imported: what runs it enters this once more.
+    """
+    before = warnings.formatwarning
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
+    try:
+        yield
+    finally:
+        warnings.formatwarning = before

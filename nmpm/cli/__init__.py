@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
-import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from importlib import import_module
 
+from nmpm._support.messages import plain_warnings
 from nmpm._support.threads import limit_spinning
 from nmpm._support.version import __version__
 from nmpm.errors import NmpmError
@@ -81,17 +80,6 @@ def usage() -> str:
     return USAGE.format(commands="\n".join(lines), configs=configs)
 
 
-@contextmanager
-def _plain_warnings() -> Iterator[None]:
-    """Shows warnings as a line each, without the line of code that they come from."""
-    before = warnings.formatwarning
-    warnings.formatwarning = lambda message, *_: f"warning: {message}\n"
-    try:
-        yield
-    finally:
-        warnings.formatwarning = before
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; errors that a user can correct, those of the file system too, are printed without a traceback.
 
@@ -118,8 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"nmpm: there is no command {words[0]!r}; {hint} See nmpm --help.\n")
         return 2
     try:
-        command: Callable[[list[str]], int | None] = import_module(COMMANDS[words[0]][0]).run
-        with _plain_warnings():
+        with plain_warnings():
+            command: Callable[[list[str]], int | None] = import_module(COMMANDS[words[0]][0]).run
             return command(words) or 0
     except NmpmError as error:
         sys.stderr.write(f"nmpm {words[0]}: {error}\n")

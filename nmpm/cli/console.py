@@ -15,6 +15,7 @@ from typing import NoReturn
 
 from lightning.pytorch.cli import LightningArgumentParser
 
+from nmpm._support.messages import plain_warnings
 from nmpm._support.shipped import PACKAGE
 from nmpm.cli.early_checks import UsageError
 from nmpm.decoders import Decoder
@@ -67,11 +68,11 @@ class _Remarks(logging.Filter):
 
 @contextmanager
 def quiet_lightning() -> Iterator[None]:
-    """Hide `REMARKS` and `WARNINGS` while it lasts; everything else is shown."""
+    """Hide `REMARKS` and `WARNINGS` while it lasts; everything else is shown, warnings without lines of code."""
     remarks = _Remarks()
     loggers = map(logging.getLogger, ("lightning.pytorch", "lightning.fabric", "lightning", ""))
     handlers = [handler for logger in loggers for handler in logger.handlers]
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), plain_warnings():
         for message in WARNINGS:
             warnings.filterwarnings("ignore", message, module=r"lightning\.")
         for handler in handlers:

@@ -245,6 +245,9 @@ class EmulatorCLI(LightningCLI):
         try:
             self.trainer.fit(**options)
             self._test_best_weights()
+            if self.trainer.is_global_zero:
+                data = self.config[self.subcommand]["data"]
+                sys.stdout.write(self.run_folder.next_commands(str(data["path"] or data["name"] or "DATA")))
         except SystemExit as ended:
             if not isinstance(ended.__context__, KeyboardInterrupt):
                 raise

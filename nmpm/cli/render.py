@@ -1,4 +1,4 @@
-"""`nmpm render out.h5`: PNG and GIF or MP4 of a trajectory."""
+"""`nmpm render out.h5 [truth.h5]`: PNG and GIF or MP4 of a trajectory, or of two beside each other."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from nmpm.errors import ConfigError
 _EXAMPLES = """\
 examples:
   nmpm render out.h5                        a rollout of nmpm rollout: out.png and out.gif
+  nmpm render out.h5 truth.h5               beside another trajectory with the same start
   nmpm render out.h5 --mp4 --out splash     splash.png and splash.mp4
   nmpm render data/test.h5 --trajectory 7   a recorded trajectory: data/test.png and data/test.gif
 """
@@ -21,13 +22,15 @@ def run(words: list[str]) -> None:
     """Run the command, e.g. ["render", "out.h5"]."""
     parser = argparse.ArgumentParser(
         prog="nmpm render",
-        description="Draw a trajectory: snapshots as PNG, animation as GIF or MP4. Of a rollout with --members it"
+        description="Draw a trajectory, or two beside each other: PNG, and GIF or MP4. Of a rollout with --members it"
         " draws one over the share of members that are at each place, and bands of height, front and energy.",
         epilog=_EXAMPLES,
         formatter_class=HelpFormatter,
     )
     parser.add_argument("file", type=Path, help="a rollout, or data of any format that nmpm inspect reads")
+    parser.add_argument("truth", type=Path, nargs="?", help="what FILE should be; errors are against it")
     add_split_option(parser, "FILE")
+    parser.add_argument("--truth-trajectory", type=int, help="index in TRUTH (default: that of --trajectory)")
     parser.add_argument(
         "--trajectory",
         type=int,
@@ -41,13 +44,15 @@ def run(words: list[str]) -> None:
     from nmpm.data.convert import Options, native_file
     from nmpm.data.format import Split
     from nmpm.viz import write_animation, write_snapshots
-    from nmpm.viz.files import read_labelled
+    from nmpm.viz.files import combine, read_labelled
     from nmpm.viz.output import check_output
 
     stem = arguments.out or derived_name(arguments.file, "")
     picture = stem.with_name(f"{stem.name}.png")
     video = stem.with_name(f"{stem.name}{'.mp4' if arguments.mp4 else '.gif'}")
-    check_exists("FILE", arguments.file)
+    for name, path in (("FILE", arguments.file), ("TRUTH", arguments.truth)):
+        if path is not None:
+            check_exists(name, path)
     split = Split(native_file(arguments.file, arguments.split, Options(family=arguments.family)))
     if not 0 <= arguments.trajectory < len(split):
         raise ConfigError(
@@ -56,5 +61,9 @@ def run(words: list[str]) -> None:
     check_output(picture, (".png",))
     check_output(video, (".gif", ".mp4"))
     trajectories = read_labelled(split, arguments.trajectory, arguments.family)
+    if arguments.truth is not None:
+        index = arguments.trajectory if arguments.truth_trajectory is None else arguments.truth_trajectory
+        truth = read_labelled(Split(native_file(arguments.truth)), index, arguments.family)
+        trajectories = combine(truth, trajectories, (str(arguments.truth), str(arguments.file)))
     for path in (write_snapshots(trajectories, picture), write_animation(trajectories, video)):
         sys.stdout.write(f"wrote {path}\n")

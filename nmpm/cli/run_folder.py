@@ -109,11 +109,26 @@ class RunFolder:
         for path in paths:
             if path.is_file():
                 return path
-        others = ", ".join(path.name for path in sorted(paths[0].parent.glob("[!.]*.ckpt"))) or "none"
+        others = [path.name for path in sorted(paths[0].parent.glob("[!.]*.ckpt"))]
+        mend = "To start a new run, call nmpm fit with --config alone."
+        if others:
+            mend = f"To go on from one, give --ckpt_path {paths[0].parent / others[0]}."
         raise ConfigError(
-            f"{self.root}: there is no {' or '.join(map(str, paths))}; checkpoints there: {others}. To start a new run,"
-            " call nmpm fit with --config alone."
+            f"{self.root}: there is no {' or '.join(map(str, paths))}; checkpoints there:"
+            f" {', '.join(others) or 'none'}. {mend}"
         )
+
+    def next_commands(self, data: str) -> str:
+        """What to do with a run that has been trained on data, a name or a path: three commands, a line each."""
+        root, data = shlex.quote(str(self.root)), shlex.quote(data)
+        commands = {
+            f"nmpm rollout {root} --data {data}": "a test scene beside its prediction, to view and to render",
+            f"nmpm trade {data} --models {root}": "its time and errors, beside the simulator's if there is one",
+            f"nmpm zoo add {root} NAME": "keep it, under a name that every command takes",
+        }
+        width = max(map(len, commands))
+        lines = [f"  {command:<{width}}  {purpose}\n" for command, purpose in commands.items()]
+        return "next:\n" + "".join(lines)
 
 
 def next_folder(root: Path) -> tuple[Path, str]:

@@ -129,8 +129,9 @@ JUNK = r"Seed set|available: |[Tt]ip: |Restor|Loaded model|stopped: |Precision|L
 
 def test_the_console_shows_the_run_and_the_users_warnings_alone(make_dataset):
     Path("mine.py").write_text(
-        "import warnings\nfrom lightning.pytorch import Callback\nclass Mine(Callback):\n"
+        "import warnings\nimport lightning.pytorch\nfrom lightning.pytorch import Callback\nclass Mine(Callback):\n"
         "    def on_train_start(self, *_):\n        warnings.warn('look out')\n"
+        "        warnings.warn_explicit('mind', UserWarning, lightning.pytorch.__file__, 7)\n"
     )
     averaging = {"class_path": "lightning.pytorch.callbacks.EMAWeightAveraging", "init_args": {"decay": 0.9}}
     Path("mine.yaml").write_text(yaml.safe_dump({"trainer": {"callbacks": [averaging, {"class_path": "mine.Mine"}]}}))
@@ -144,13 +145,16 @@ def test_the_console_shows_the_run_and_the_users_warnings_alone(make_dataset):
     assert contradiction == "Warning: these data contradict themselves:"
     assert shared.startswith("  - shared trajectories: train and valid: 1 of 1 trajectories are the same")
     assert "nmpm inspect" in advice
-    assert "look out" in others[0]
-    assert len(others) <= 2  # the warning and its line of code
+    assert others == ["warning: look out", "warning: mind"]
     lines = run.stdout.replace("\r", "\n").splitlines()
     assert lines.pop(0).startswith("Data: dataset. Model: UNet, ")
     assert computes_bfloat16(torch.device("cpu")) or lines.pop(0).startswith("bfloat16 is emulated ")
     assert lines.pop(0).startswith("Files: run.")
-    assert lines[-1].startswith("written to run: report.json")
+    *lines, rollout, trade, keep = lines
+    assert lines[-2:] == ["written to run: report.json, errors.csv, rollout.png, rollout.gif", "next:"]
+    assert rollout.startswith("  nmpm rollout run --data ")
+    assert " --models run " in trade
+    assert keep.startswith("  nmpm zoo add run NAME ")
     assert not re.search(JUNK, run.stdout + run.stderr)
 
 

@@ -311,3 +311,22 @@ def test_a_run_is_not_written_over(tmp_path, old):
     touch(tmp_path / old)
     with pytest.raises(ConfigError, match=rf"{tmp_path / old} is of another run, and would be written over: choose"):
         folder.check_new()
+
+
+@pytest.mark.parametrize(
+    ("old", "mend"),
+    [
+        ([], "call nmpm fit with --config alone"),
+        (["checkpoints/best.ckpt"], "give --ckpt_path .*/best.ckpt"),
+    ],
+)
+def test_a_checkpoint_that_is_not_there_is_answered_by_what_then_works(tmp_path, old, mend):
+    """It advised a fit without it, which refused a folder that already held a run."""
+    folder = RunFolder.of(tmp_path, {})
+    for name in old:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(ConfigError, match=mend):
+        folder.checkpoint("last")
+    if not old:
+        folder.check_new()

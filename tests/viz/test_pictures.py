@@ -218,6 +218,20 @@ def test_render_writes_snapshots_and_an_animation(words, stem, suffix, capsys):
 
 
 @pytest.mark.usefixtures("rollout")
+def test_render_draws_a_truth_of_another_file_beside_it(monkeypatch, capsys):
+    run = Split(Path("out.h5")).read(0)
+    write_split(Path("truth.h5"), [run, dataclasses.replace(run, position=run.position + 0.2)])
+    drawn = []
+    monkeypatch.setattr("nmpm.viz.write_animation", lambda shown, path: drawn.append(shown) or path)
+    assert main(["render", "out.h5", "truth.h5"]) == 0
+    assert list(drawn[0].positions) == ["truth.h5", "out.h5"]
+    assert main(["render", "out.h5", "truth.h5", "--truth-trajectory", "1"]) == 1
+    assert "do not start at the same positions" in capsys.readouterr().err
+    assert main(["render", "out.h5", "none.h5"]) == 1
+    assert "TRUTH none.h5: there is no such file" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("rollout")
 @pytest.mark.parametrize(
     ("words", "message"),
     [
