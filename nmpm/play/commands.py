@@ -30,7 +30,7 @@ class Throw(Command):
     velocity: Vector
 
     def apply(self, session: Session) -> None:
-        session.throw(self.material, self.at, self.sides, self.velocity)
+        session.throw(self)
 
 
 @dataclass(frozen=True)

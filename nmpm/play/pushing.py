@@ -1,15 +1,29 @@
-"""What bodies do to particles when they are dragged: push them out, and along."""
+"""Bodies that a player moves, and what they do to particles then: push them out, and along."""
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+from nmpm.emulator import Emulator
 from nmpm.obstacles import Body, Disc, Ramp
 
 Movable = Ramp | Disc
+
+
+ANGLE = -0.4
+"""Of new ramps, in radians."""
+
+
+def new_body(kind: Literal["ramp", "disc"], centre: tuple[float, ...], emulator: Emulator) -> Movable:
+    """A ramp or a disc, of a size that suits the scene and that the grid resolves."""
+    cell, side = min(emulator.grid.spacing), min(high - low for low, high in emulator.scene.bounds)
+    if kind == "disc":
+        return Disc(centre, max(2 * cell, 0.07 * side))
+    return Ramp(centre, 0.3 * side, max(1.5 * cell, 0.03 * side), ANGLE)
 
 
 def moved(body: Movable, centre: tuple[float, ...], angle: float) -> Movable:

@@ -10,22 +10,23 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import torch
 
 from nmpm._support.messages import one_line
 from nmpm.data.described import described_metadata
 from nmpm.data.write import write_trajectory
-from nmpm.emulator.calibration import calibrated_range
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.obstacles import Disc, Ramp
 from nmpm.play import pictures
 from nmpm.play.beside import SimulatorBeside
-from nmpm.play.commands import Pour
+from nmpm.play.commands import Pour, Throw
+from nmpm.play.limits import Limits
 from nmpm.play.messages import read_command
-from nmpm.play.placing import block, row, with_room
-from nmpm.play.pushing import Movable, moved, push
+from nmpm.play.placing import block, with_room
+from nmpm.play.pouring import Jet
+from nmpm.play.pushing import ANGLE, Movable, moved, new_body, push
 from nmpm.play.recording import Recording
 from nmpm.play.start import simulator_of, start_of
 from nmpm.play.world import World
@@ -36,19 +37,10 @@ if TYPE_CHECKING:
 
 Message = str | bytes
 
-MOST_PARTICLES = 12_000
-"""In a scene; fewer where the box holds fewer."""
-_FILLED = 0.8
-"""Share of the box that particles may fill."""
 MOST_BODIES = 12
-LARGEST_SEED = 2**31 - 1
 AHEAD = 4
 """Pictures that may be on their way: a page that draws fewer than 60 a second, or is hidden, slows the session."""
 _STATUS_TICKS = 15
-_ROWS = 2
-"""Of particles that are poured at once."""
-_LEAST_POUR = 0.5
-"""Rows of what is poured slowly follow each other every so many frames: share of a spacing that counts in a frame."""
 
 
 class Session:
@@ -62,13 +54,10 @@ class Session:
 
     def __init__(self, model: Pretrained, seed: int, out: Path) -> None:
         self.model, self.scene, self.out = model, model.scene, out
-        room = int(_FILLED * self.scene.volume / self.scene.particle_volume)
-        self.most_particles = min(MOST_PARTICLES, room)
+        self.limits = Limits(model)
         self.playing, self.pace = True, 1
         self._preset = simulator_of(model)
         self._beside: SimulatorBeside | None = None
-        self._fastest = _fastest(model)
-        self._pour: Pour | None = None
         self._outbox: list[Message] = []
         self._ticks = self._picture = self._seen = 0
         self.restart(seed)
@@ -90,9 +79,9 @@ class Session:
         facts = {
             "model": self.model.name,
             "seed": self.seed,
-            "most": self.most_particles,
-            "limits": self._fastest.amin(dim=1).tolist(),
-            "fastest": 0.3 * float(self._fastest.amin()) * self.scene.dt,
+            "most": self.limits.most_particles,
+            "limits": self.limits.fastest.amin(dim=1).tolist(),
+            "fastest": 0.3 * float(self.limits.fastest.amin()) * self.scene.dt,
             "obstaclesMove": self.scene.obstacles and self.scene.dim == 2,
             "gravityTurns": self.scene.gravity_varies,
             "simulator": None if self._preset is None else self._preset.generator,
@@ -128,61 +117,38 @@ class Session:
 
     # What a player can do; see `nmpm.play.commands`.
 
-    def throw(self, material: int, at: Sequence[float], sides: Sequence[float], velocity: Sequence[float]) -> None:
-        self._check_material(material)
-        for name, vector in (("at", at), ("sides", sides), ("velocity", velocity)):
-            self._check_vector(name, vector)
-        self._check_speed(material, velocity)
-        extent = max(high - low for low, high in self.scene.bounds)
-        if not all(0 < side <= extent for side in sides):
-            raise ConfigError(f"a block {_numbers(sides)} wide: each side must be positive, and at most {extent:g}")
-        if math.prod(sides) / self.scene.particle_volume > self.most_particles:
-            raise ConfigError(f"a block {_numbers(sides)} wide has more than {self.most_particles} particles")
-        if not self._add(block(at, sides, self.scene.particle_spacing), velocity, material):
+    def throw(self, throw: Throw) -> None:
+        self.limits.check_throw(throw)
+        points = block(throw.at, throw.sides, self.scene.particle_spacing)
+        if not self._add(points, throw.velocity, throw.material):
             raise ConfigError("there is no room for a block here")
 
     def pour(self, pour: Pour | None) -> None:
         if pour is not None:
-            self._check_material(pour.material)
-            for name, vector in (("at", pour.at), ("velocity", pour.velocity)):
-                self._check_vector(name, vector)
-            self._check_speed(pour.material, pour.velocity)
-            narrowest = min(high - low for low, high in self.scene.bounds)
-            if not 0 < pour.width <= narrowest / 2:
-                raise ConfigError(f"width = {pour.width:g} must be positive, and at most {narrowest / 2:g}")
-            if not any(pour.velocity):
-                raise ConfigError("what is poured needs a velocity")
-        if pour is None or self._pour is None:
-            self._poured = math.inf  # the first row comes at once
-        self._pour = pour
+            self.limits.check_pour(pour)
+        self._jet.turn(pour)
 
     def move(self, number: int, centre: Sequence[float], angle: float) -> None:
         before = self._body(number)
-        self._check_vector("centre", centre)
+        self.limits.check_vector("centre", centre)
         body = moved(before, tuple(centre), math.remainder(angle, 2 * math.pi))
         self.world.set_bodies({**self.world.bodies, number: body})
         state = self.world.now()
-        margin, limit = 0.5 * self.scene.particle_spacing, self._fastest.amin(dim=0) * self.scene.dt
+        margin, limit = 0.5 * self.scene.particle_spacing, self.limits.fastest.amin(dim=0) * self.scene.dt
         position, velocity = push(body, state.position[0], state.velocity[0], margin, limit)
         low, high = position.new_tensor(self.scene.bounds).T
         self.world.set_motion(position.clamp(low, high)[None], velocity[None])
         self._bodies_changed()
 
-    def put(self, kind: str, centre: Sequence[float]) -> None:
-        self._check_vector("centre", centre)
+    def put(self, kind: Literal["ramp", "disc"], centre: Sequence[float]) -> None:
+        self.limits.check_vector("centre", centre)
         if self.scene.dim != 2:
             raise ConfigError("bodies can be put into scenes in two dimensions alone")
         if len(self.world.bodies) >= MOST_BODIES:
             raise ConfigError(f"there are {MOST_BODIES} bodies already: take one away first")
-        cell = min(self.model.emulator.grid.spacing)
-        side = min(high - low for low, high in self.scene.bounds)
-        kinds: dict[str, Movable] = {
-            "ramp": Ramp(tuple(centre), 0.3 * side, max(1.5 * cell, 0.03 * side), -0.4),
-            "disc": Disc(tuple(centre), max(2 * cell, 0.07 * side)),
-        }
         number = 1 + max(self.world.bodies, default=-1)
-        self.world.set_bodies({**self.world.bodies, number: kinds[kind]})
-        self.move(number, centre, -0.4)
+        self.world.set_bodies({**self.world.bodies, number: new_body(kind, tuple(centre), self.model.emulator)})
+        self.move(number, centre, ANGLE)
 
     def remove(self, number: int) -> None:
         self._body(number)
@@ -190,7 +156,7 @@ class Session:
         self._bodies_changed()
 
     def set_gravity(self, vector: Sequence[float]) -> None:
-        self._check_vector("gravity", vector)
+        self.limits.check_vector("gravity", vector)
         builder = StateBuilder(self.model.emulator, self.world.now().position, torch.float32)
         self.world.set_gravity(builder.gravity(vector))
         self._scene_changed()
@@ -201,11 +167,10 @@ class Session:
         self._changed = True
 
     def restart(self, seed: int) -> None:
-        if not 0 <= seed <= LARGEST_SEED:
-            raise ConfigError(f"seed = {one_line(seed, 30)} must be 0 … {LARGEST_SEED}")
+        self.limits.check_seed(seed)
         self.world = World(self.model.emulator, start_of(self.model, seed))
         self.seed, self.frame, self.recording = seed, 0, Recording()
-        self._pour, self._poured = None, math.inf
+        self._jet = Jet(self.scene.particle_spacing, self.scene.dt)
         self._show_all()
         self._scene_changed()
 
@@ -221,10 +186,8 @@ class Session:
             self._beside = beside
 
     def save(self) -> None:
-        model = f"the model {self.model.name}, played with"
-        world = self.world
-        state = world.now()
-        made = self.recording.trajectory(self.scene, world.material, state.gravity, world.static, model)
+        model, world = f"the model {self.model.name}, played with", self.world
+        made = self.recording.trajectory(self.scene, world.material, world.now().gravity, world.static, model)
         path = _free_name(self.out)
         write_trajectory(path, made, described_metadata(made.attributes, path, len(made.position)))
         lost = f", without the first {self.recording.forgotten}" if self.recording.forgotten else ""
@@ -234,22 +197,6 @@ class Session:
         if not self._seen <= picture <= self._picture:
             raise ConfigError(f"picture = {one_line(picture, 30)} was not sent")
         self._seen = picture
-
-    # Checks.
-
-    def _check_material(self, material: int) -> None:
-        names = self.scene.materials
-        if not 0 <= material < len(names):
-            raise ConfigError(f"material = {one_line(material, 30)}: there are {len(names)}, {', '.join(names)}")
-
-    def _check_vector(self, name: str, vector: Sequence[float]) -> None:
-        if len(vector) != self.scene.dim:
-            raise ConfigError(f"{name} has {len(vector)} numbers; this scene has {self.scene.dim} axes")
-
-    def _check_speed(self, material: int, velocity: Sequence[float]) -> None:
-        limits = self._fastest[material].tolist()
-        if any(abs(part) > limit for part, limit in zip(velocity, limits, strict=True)):
-            raise ConfigError(f"a velocity of {_numbers(velocity)} is beyond {_numbers(limits)}, which the model knows")
 
     def _body(self, number: int) -> Movable:
         body = self.world.bodies.get(number)
@@ -261,29 +208,19 @@ class Session:
 
     def _advance(self) -> None:
         """The next frame, with what is poured until there."""
-        if self._pour is not None:
-            self._pour_rows(self._pour)
+        if self._jet.pour is not None:
+            self._add_poured(self._jet.pour)
         self.world.advance()
         self.frame += 1
         self.recording.add(self.world.position, self.world.bodies)
 
-    def _pour_rows(self, pour: Pour) -> None:
-        """Pour some rows at once, one behind the other: each time costs a call."""
-        spacing, length = self.scene.particle_spacing, _ROWS * self.scene.particle_spacing
-        speed = math.hypot(*pour.velocity)
-        self._poured += max(speed * self.scene.dt, _LEAST_POUR * spacing)
-        if self._poured < length:
-            return
-        self._poured = 0.0
-        ahead = [
-            [x + number * spacing * v / speed for x, v in zip(pour.at, pour.velocity, strict=True)]
-            for number in range(_ROWS)
-        ]
-        rows = torch.cat([row(at, pour.velocity, pour.width, spacing) for at in ahead])
+    def _add_poured(self, pour: Pour) -> None:
+        rows = self._jet.rows(pour)
         try:
-            self._add(rows, pour.velocity, pour.material)
+            if rows is not None:
+                self._add(rows, pour.velocity, pour.material)
         except ConfigError as error:
-            self._pour = None
+            self._jet.turn(None)
             self.say(str(error))
 
     def _add(self, points: torch.Tensor, velocity: Sequence[float], material: int) -> int:
@@ -291,8 +228,8 @@ class Session:
         world = self.world
         others = [position.double() for position in (world.position, world.static[0])]
         free = with_room(points, self.scene, others, world.bodies.values())
-        if world.count + len(free) > self.most_particles:
-            raise ConfigError(f"there are at most {self.most_particles} particles: restart to begin anew")
+        if world.count + len(free) > self.limits.most_particles:
+            raise ConfigError(f"there are at most {self.limits.most_particles} particles: restart to begin anew")
         if len(free):
             world.add(free, torch.tensor(velocity, dtype=torch.float64) * self.scene.dt, material)
             self._particles_changed()
@@ -313,10 +250,9 @@ class Session:
             self._try_beside()
 
     def _try_beside(self) -> None:
-        beside = self._beside
         try:
-            if beside is not None:
-                beside.start(self.world, self.frame)
+            if self._beside is not None:
+                self._beside.start(self.world, self.frame)
         except NmpmError as error:
             self.set_beside(False)
             self.say(one_line(error, 300))
@@ -361,20 +297,7 @@ class Session:
         return sent
 
 
-def _fastest(model: Pretrained) -> torch.Tensor:
-    """(materials, D) largest speeds in length per second: those that the model was calibrated for."""
-    scene = model.scene
-    ranges = [calibrated_range(model.emulator, f"{name}.velocity_") for name in scene.materials]
-    limits = torch.stack([torch.maximum(low.abs(), high.abs()) for low, high in ranges])
-    sides = torch.tensor([high - low for low, high in scene.bounds], dtype=torch.float64)
-    return torch.minimum(limits.cpu().double(), sides / (10 * scene.dt))
-
-
 def _free_name(path: Path) -> Path:
     """The path, or with the first number for which there is no file."""
     numbered = (path.with_stem(f"{path.stem}-{number}") for number in range(2, 10_000))
     return next(name for name in (path, *numbered) if not name.exists())
-
-
-def _numbers(values: Sequence[float]) -> str:
-    return " × ".join(f"{value:.3g}" for value in values)

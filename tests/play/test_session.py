@@ -51,7 +51,7 @@ def test_blocks_take_no_room_of_others_and_no_more_than_there_is(play, monkeypat
     assert "beyond" in throw(player, velocity=[100.0, 0.0])
     assert "2 axes" in throw(player, at=[0.5, 0.5, 0.5])
     assert "there are 1, goop" in throw(player, material=1)
-    player.session.most_particles = player.session.world.count + 10
+    player.session.limits.most_particles = player.session.world.count + 10
     assert "at most" in throw(player)
     assert len(player.position) == player.session.world.count
 
@@ -249,7 +249,7 @@ def malformed(rng):
 
 def test_a_thousand_malformed_messages_leave_the_session_running(play):
     player, rng = play(), random.Random(0)
-    player.session.most_particles = player.session.world.count + 300
+    player.session.limits.most_particles = player.session.world.count + 300
     for text in ["[" * 999, "", "null", "{}", '{"do": ["throw"]}', "x" * 10_000, b"\xff" * 900]:
         player.session.receive(text)
     for number in range(1000):
