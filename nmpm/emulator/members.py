@@ -54,14 +54,11 @@ def predict_members(
 ) -> Rollout:
     """All frames of `stream_members` at once: positions (M, B, frames, N, D) and fields (M, B, frames, N)."""
     parts = list(stream_members(emulator, state, frames, members, seed, nudge, prescribed, monitor))
-    scenes, count, dim = state.position.shape
-    shape = (members, scenes, frames, count)
-    if not parts:  # of no scene, or of no frame
-        none = state.position.new_zeros(*shape, dim)
-        return Rollout(none, dict.fromkeys(emulator.scene.evolving, none[..., 0]))
-    whole = Rollout.join(parts)
-    fields = {name: values.view(shape) for name, values in whole.fields.items()}
-    return Rollout(whole.position.view(*shape, dim), fields)
+    if parts:
+        return Rollout.join(parts).by_member(members)
+    scenes, *rest = state.position.shape
+    none = state.position.new_zeros(members, scenes, frames, *rest)  # of no scene, or of no frame
+    return Rollout(none, dict.fromkeys(emulator.scene.evolving, none[..., 0]))
 
 
 def stream_members(

@@ -148,6 +148,11 @@ class Rollout(NamedTuple):
         fields = {name: torch.cat([part.fields[name] for part in parts]) for name in parts[0].fields}
         return cls(torch.cat([part.position for part in parts]), fields)
 
+    def by_member(self, members: int) -> Rollout:
+        """The rows (M·B, …) of M members as (M, B, …)."""
+        fields = {name: values.unflatten(0, (members, -1)) for name, values in self.fields.items()}
+        return self._replace(position=self.position.unflatten(0, (members, -1)), fields=fields)
+
     def cpu(self) -> Rollout:
         """The same on the CPU."""
         return Rollout(self.position.cpu(), {name: values.cpu() for name, values in self.fields.items()})

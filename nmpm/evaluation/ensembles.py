@@ -44,17 +44,9 @@ class EnsembleTest:
             window: One recorded scene of T + 2 frames; with the scenes before it, it determines the members.
             predicted: (1, T, N, D) the one rollout.
         """
-        seed, there = len(self.scores.rows), window.to(self.emulator.device)
-        scored = with_predicted(window, self.emulator.frames).to("cpu")
-        parts = stream_members(
-            self.emulator,
-            there.initial,
-            window.target.shape[1],
-            self.members,
-            seed,
-            self.nudge,
-            Prescribed.of(there),
-        )
+        start, frames, seed = window.to(self.emulator.device), window.target.shape[1], len(self.scores.rows)
+        prescribed, scored = Prescribed.of(start), with_predicted(window, self.emulator.frames).to("cpu")
+        parts = stream_members(self.emulator, start.initial, frames, self.members, seed, self.nudge, prescribed)
         self.scores.update(scored, (part.position for part in parts))
         self.single.update(scored, [predicted])
 

@@ -49,10 +49,7 @@ def predict_trusted(
     tracker = TrustTracker(emulator.scene, state, trust)
     watched = stream_watched(emulator, state, frames, tracker, members, seed, nudge, prescribed)
     made = Rollout.join(list(until_trusted(watched, tracker)))._replace(trusted=tracker.frames)
-    if members is None:
-        return made
-    fields = {name: values.unflatten(0, (members, -1)) for name, values in made.fields.items()}
-    return made._replace(position=made.position.unflatten(0, (members, -1)), fields=fields)
+    return made if members is None else made.by_member(members)
 
 
 def predict_and_simulate(emulator: Emulator, trust: Trust, state: Particles, frames: int, preset: Preset) -> Rollout:
@@ -112,7 +109,7 @@ def fitting_preset(scene: Scene, state: Particles, preset: Preset) -> Preset:
         f"its particles have the volume {theirs.particle_volume:g}, the model's {scene.particle_volume:g}": (
             not math.isclose(scene.particle_volume, theirs.particle_volume, rel_tol=_SAME)
         ),
-        "its particles are all of one size": not _are_of_one_size(state),
+        "its particles are all of one size": state.volume is not None and bool((state.volume[state.mask] != 1).any()),
         f"it has no {', '.join(scene.fields)}": bool(scene.fields),
         "its obstacles do not move": scene.moving_obstacles,
         "it simulates only states that it has drawn": isinstance(preset, MpmMixture),
@@ -130,10 +127,6 @@ def fitting_preset(scene: Scene, state: Particles, preset: Preset) -> Preset:
 
 def _are_near(ours: tuple[Interval, ...], theirs: tuple[Interval, ...], side: float) -> bool:
     return len(ours) == len(theirs) and np.allclose(ours, theirs, rtol=0, atol=_SAME * side)
-
-
-def _are_of_one_size(state: Particles) -> bool:
-    return state.volume is None or bool((state.volume[state.mask] == 1).all())
 
 
 def _obstacle(state: Particles, index: int) -> Array:

@@ -106,6 +106,17 @@ def test_the_grid_moves_in_replays_as_it_does_without(step, replays):
     assert len(replays) == 9
 
 
+def test_the_noise_of_members_is_drawn_in_replays_as_it_is_without(step, replays, device):
+    made, batches = step(members=2, record=True)
+    eager, _ = step(members=2)
+    for batch in batches:
+        assert_same(gradients(made, batch), gradients(eager, batch), device)
+    processor, channels = made.emulator.processor, len(made.emulator.scene.input_channels)
+    first = processor.get_parameter(f"{processor.channel_layers.first}.weight")
+    assert float(first.grad[:, channels : channels + processor.noise].abs().max()) > 0
+    assert len(replays) == 3
+
+
 def test_batches_of_several_sizes_share_a_graph_by_padding(step, replays, monkeypatch):
     monkeypatch.setattr(module, "MULTIPLE", 16)
     quiet = {"position_noise": 0.0, "grid_noise": 0.0}

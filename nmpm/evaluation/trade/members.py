@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
+from torch import Tensor
 
-from nmpm.emulator import Prescribed, stream_members
-from nmpm.emulator.members import nudge_of
+from nmpm.emulator import Prescribed
+from nmpm.emulator.members import nudge_of, predict_members
 from nmpm.evaluation.trade.choices import ModelChoice, Rollout
 from nmpm.evaluation.trade.scenes import Scenes
 
@@ -33,10 +33,8 @@ class MembersChoice(ModelChoice):
         window = scenes.window(indices)
         state, prescribed = window.initial.to(self.device), Prescribed.of(window)
         given = prescribed and prescribed.to(self.device)
-        return lambda frames: torch.cat(
-            [
-                part.position
-                for part in stream_members(self.emulator, state, frames, self.members, index, prescribed=given)
-            ],
-            dim=1,
-        )
+
+        def predict(frames: int) -> Tensor:
+            return predict_members(self.emulator, state, frames, self.members, index, prescribed=given).position[:, 0]
+
+        return predict

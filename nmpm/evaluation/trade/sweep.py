@@ -112,11 +112,8 @@ class Sweep:
 
     def with_members(self, count: int) -> Sweep:
         """The sweep with ensembles of so many members, and the fair CRPS of all choices."""
-        models, measures = (
-            dataclasses.replace(self.models, members=count),
-            dataclasses.replace(self.measures, crps=True),
-        )
-        return dataclasses.replace(self, models=models, measures=measures)
+        models = dataclasses.replace(self.models, members=count)
+        return dataclasses.replace(self, models=models, measures=dataclasses.replace(self.measures, crps=True))
 
 
 def shipped_sweep_text(name: str) -> str:
