@@ -52,6 +52,11 @@ def add_device_option(parser: argparse.ArgumentParser, purpose: str = "") -> Non
     )
 
 
+def add_style_option(parser: argparse.ArgumentParser, drawn: str) -> None:
+    """Add the option `--style`, a key of `nmpm.viz.output.STYLES`; `drawn` begins its help."""
+    parser.add_argument("--style", choices=("talk", "paper"), help=f"{drawn} for slides (SVG) or for print (PDF)")
+
+
 def add_threads_option(parser: argparse.ArgumentParser) -> None:
     """Add the option `--threads`."""
     parser.add_argument(

@@ -14,6 +14,7 @@ from nmpm.cli.options import (
     HelpFormatter,
     add_data_options,
     add_device_option,
+    add_style_option,
     check_at_least,
     check_device,
     check_folder,
@@ -89,6 +90,7 @@ def add_scene_options(parser: argparse.ArgumentParser, command: str, scenes: int
         "--wider", type=int, metavar="TIMES", help="simulate scenes of a domain so many times as wide, with more blocks"
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help=f"folder to write to (default: {command}/DATASET)")
+    add_style_option(parser, "also the chart of time and error")
     add_device_option(parser)
     add_match_options(parser)
     add_data_options(parser)
@@ -112,6 +114,7 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
     from nmpm._support.devices import find_device
     from nmpm.evaluation import trade
     from nmpm.evaluation.trade.report import likely_points, report_lines, summary_table, write_report
+    from nmpm.viz.output import STYLES
 
     if options.config is None:
         sweep = trade.read_sweep(trade.shipped_sweep_text(command), f"the sweep of nmpm {command}")
@@ -138,7 +141,7 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
     console.print(summary_table(shown, points, scenes))
     for line in report_lines(points):
         console.print(line, highlight=False, soft_wrap=True)
-    paths = write_report(out, command, points, scenes)
+    paths = write_report(out, command, points, scenes, options.style and STYLES[options.style])
     sys.stderr.write(f"wrote {', '.join(map(str, paths))}\n")
 
 

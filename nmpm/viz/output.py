@@ -2,12 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
 
 from nmpm._support.atomic import atomic_write, file_obstacle
 from nmpm.errors import ConfigError, DataError
+
+
+class PictureStyle(NamedTuple):
+    """What a picture is for.
+
+    Args:
+        suffix: Of its file.
+        columns: Frames of snapshots.
+        size: Width and height of a chart in inches.
+        font_size: Of a chart, in points.
+    """
+
+    suffix: str
+    columns: int
+    size: tuple[float, float]
+    font_size: float
+
+
+STYLES: Mapping[str, PictureStyle] = MappingProxyType(
+    {
+        "talk": PictureStyle(".svg", columns=3, size=(9.0, 5.06), font_size=14.0),
+        "paper": PictureStyle(".pdf", columns=6, size=(6.5, 4.2), font_size=8.0),
+    }
+)
+"""Few and large things on a slide of 16:9, an SVG; the width of a page's text, a PDF."""
 
 
 def check_output(path: Path, suffixes: Sequence[str]) -> str:

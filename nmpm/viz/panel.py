@@ -22,7 +22,7 @@ from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
 SUPERSAMPLING = 3
 """Canvas points per pixel along each axis."""
-DISC_DIAMETER = 1.5
+DISC_DIAMETER = 1.6
 """Diameter of a disc in particle spacings: above √2, from which on the discs of a square lattice leave no gaps."""
 DIAMETER_LIMITS = (2.2, 24.0)
 """Smallest and largest diameter of a disc in pixels."""

@@ -43,7 +43,7 @@ def write_snapshots(trajectories: LabelledTrajectories, path: Path | str, column
 
     Args:
         trajectories: What to draw.
-        path: A `.png` file; an existing one is replaced only when the new one is complete.
+        path: A `.png`, `.svg` or `.pdf` file; an existing one is replaced only when the new one is complete.
         columns: Number of frames to draw; fewer if the trajectories are shorter.
 
     Returns:
@@ -56,10 +56,10 @@ def write_snapshots(trajectories: LabelledTrajectories, path: Path | str, column
     path = Path(path)
     if columns < 1:
         raise ConfigError(f"Snapshots need at least one column; columns = {columns}.")
-    check_output(path, (".png",))
+    suffix = check_output(path, (".png", ".svg", ".pdf"))
     style = {"font.family": "DejaVu Sans", "font.size": FONT_SIZE, "axes.linewidth": 0.6}
     with mpl.rc_context(style), replace_picture(path) as temporary:
-        _Snapshots(trajectories, columns).figure.savefig(temporary, dpi=DPI, format="png")
+        _Snapshots(trajectories, columns).figure.savefig(temporary, dpi=DPI, format=suffix[1:])
     return path
 
 

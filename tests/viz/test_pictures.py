@@ -232,6 +232,14 @@ def test_render_draws_a_truth_of_another_file_beside_it(monkeypatch, capsys):
 
 
 @pytest.mark.usefixtures("rollout")
+@pytest.mark.parametrize(("style", "file", "start"), [("talk", "out.svg", b"<?xml"), ("paper", "out.pdf", b"%PDF")])
+def test_render_writes_snapshots_for_slides_and_print(style, file, start):
+    assert main(["render", "out.h5", "--style", style]) == 0
+    assert Path(file).read_bytes().startswith(start)
+    assert {path.name for path in Path().iterdir()} == {"out.h5", file, "out.gif"}
+
+
+@pytest.mark.usefixtures("rollout")
 @pytest.mark.parametrize(
     ("words", "message"),
     [

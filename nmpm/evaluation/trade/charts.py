@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
-from adjustText import adjust_text
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+from matplotlib.transforms import Bbox
 
 from nmpm._support.atomic import atomic_write
 from nmpm.evaluation.bootstrap import Floats
@@ -21,6 +24,7 @@ from nmpm.evaluation.trade.choices import Kind
 from nmpm.evaluation.trade.ranking import Point, Rank, rank
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.sweep import OTHER_SCENES
+from nmpm.viz.output import PictureStyle
 from nmpm.viz.panel import PanelRenderer
 from nmpm.viz.trajectories import LabelledTrajectories
 
@@ -43,14 +47,29 @@ _LINES: Mapping[Kind, dict[str, Any]] = MappingProxyType(
     }
 )
 _FAR = 100  # a line further below all points than this factor is named in the title, not drawn
-_MOVES = 300  # of the names that are in each other's way
+_MOST_NAMES = 10
+_Spot = tuple[tuple[float, float], str, str]
+_SPOTS: Sequence[_Spot] = [
+    ((x * away, y * away), {1: "left", 0: "center", -1: "right"}[x], {1: "bottom", 0: "center", -1: "top"}[y])
+    for away in (9, 18, 32, 50)
+    for x, y in ((1, 1), (-1, -1), (0, 1), (0, -1), (-1, 1), (1, -1), (1, 0), (-1, 0))
+]
+"""Where a name may be beside its point, in points of type, and which of its sides is there; the best first."""
+_LINE_SPOTS: Sequence[_Spot] = [((x, 2), "left", "bottom") for x in (4, 90, 180, 270)]
 _PANEL = 420  # pixels of a square panel's side
 
 
-def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes) -> None:
-    """Write a PNG: emulators and simulator settings as points with bootstrap intervals, the others as lines.
+def draw_styled_chart(path: Path, points: Sequence[Point], scenes: Scenes, style: PictureStyle) -> None:
+    """Write the chart of `draw_chart` as large and with letters as a talk or a paper needs."""
+    with mpl.rc_context({"font.size": style.font_size}):
+        draw_chart(path, points, scenes, style.size)
 
-    Points that predict several scenes at once are left out, as are unstable ones. Rings mark the Pareto set.
+
+def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes, size: tuple[float, float] = (9.0, 5.8)) -> None:
+    """Write a picture, in the format of its suffix: emulators and simulator settings as points, the others as lines.
+
+    Points have bootstrap intervals. Those that predict several scenes at once are left out, as are unstable ones. Rings
+    mark the Pareto set, and a line connects it.
     """
     ranks = rank(points)
     shown = [p for p in points if p.stable and p.batch == 1 and p.name in ranks and math.isfinite(p.milliseconds)]
@@ -60,7 +79,7 @@ def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes) -> None:
     near = [p for p in lines if ranks[p.name].mean > least / _FAR]
     far = "; ".join(f"{p.name}: {ranks[p.name].mean:.1g}" for p in lines if p not in near)
 
-    figure = _figure(9, 5.8)
+    figure = _figure(*size)
     axes = figure.subplots()
     marked = [p for p in measured if not p.exact]
     for kind, style in _MARKERS.items():
@@ -72,12 +91,13 @@ def draw_chart(path: Path, points: Sequence[Point], scenes: Scenes) -> None:
         if point.exact:  # a logarithmic axis cannot show an error of 0
             axes.axvline(point.milliseconds, color="#c8642a", lw=1, label="simulator as shipped")
     _scale(axes, measured)
+    _draw_frontier(axes, measured, ranks)
     machine = f"; {shown[0].times.hardware}, 1 thread, {shown[0].times.clock}" if shown else ""
     axes.set(xlabel=f"milliseconds per frame, one scene at a time{machine}", ylabel="MSE of the full rollout")
     below = f"\n(below the picture: {far})" if far else ""
     axes.set_title(f"{scenes.name}: time and error on {len(scenes)} test scenes{below}")
     if marked:
-        figure.legend(loc="outside lower center", ncols=len(_MARKERS) + 1, frameon=False)
+        figure.legend(loc="outside lower center", ncols=3, frameon=False)
     _write_names(axes, marked, near, ranks)
     _save(figure, path)
 
@@ -109,22 +129,60 @@ def _scale(axes: Any, measured: Sequence[Point]) -> None:
     axes.set_axisbelow(True)
 
 
+def _draw_frontier(axes: Any, measured: Sequence[Point], ranks: Mapping[str, Rank]) -> None:
+    """A line through the Pareto set, and an arrow to where better points would be."""
+    members = sorted((p for p in measured if ranks[p.name].member), key=lambda p: p.milliseconds)
+    errors = [ranks[p.name].mean for p in members if not p.exact]
+    if errors:  # an exact one is at the end of the line, which goes on below the picture there
+        errors += [errors[-1]] * (len(members) - len(errors))
+        times = [p.milliseconds for p in members]
+        axes.plot(times, errors, drawstyle="steps-post", color="0.6", lw=1.2, zorder=1, label="frontier")
+    arrow = {"arrowstyle": "-|>", "color": "0.35", "lw": 1.2}
+    axes.annotate("better", (0.01, 0.015), (0.06, 0.08), "axes fraction", color="0.35", arrowprops=arrow)
+
+
 def _write_names(axes: Any, marked: Sequence[Point], lines: Sequence[Point], ranks: Mapping[str, Rank]) -> None:
-    """Names beside points, joined to those that they had to leave, and above the left end of lines."""
-    names = []
-    for p in marked:
-        short = p.name.removeprefix("simulator, ").replace(OTHER_SCENES, "")
-        text = f"   {short.replace(' resolution', '').replace('bfloat16', 'bf16')}   "  # spaces keep it off the marker
-        colour = _MARKERS[p.kind, p.of_other_scenes]["color"]
-        names.append(axes.text(p.milliseconds, ranks[p.name].mean, text, fontsize=7, va="center", color=colour))
-    left = axes.get_xlim()[0]
-    texts = [
-        axes.text(left, ranks[p.name].mean, f" {p.name}", fontsize=7.5, va="bottom", color=_LINES[p.kind]["color"])
-        for p in lines
-    ]
-    if names:
-        arrows = {"arrowstyle": "-", "color": "0.6", "lw": 0.6}
-        adjust_text(names, ax=axes, objects=texts or None, iter_lim=_MOVES, arrowprops=arrows)
+    """Names of at most `_MOST_NAMES` points and lines, where nothing else is.
+
+    The Pareto set comes first, then lines, then the best others of each kind in turn.
+    """
+    axes.figure.draw_without_rendering()
+    left, inside = axes.get_xlim()[0], axes.get_window_extent()
+    taken = [_text_box(text) for text in axes.texts]
+    taken += [Bbox.from_extents(*at, *at).padded(5) for at in map(axes.transData.transform, _places(marked, ranks))]
+    best = sorted(marked, key=lambda p: (-ranks[p.name].probability, ranks[p.name].mean))
+    members = [p for p in best if ranks[p.name].member]
+    others = {kind: [p for p in best if p.kind is kind and p not in members] for kind in Kind}
+    in_turn = [p for row in zip_longest(*others.values()) for p in row if p is not None]
+    for p in [*members, *lines, *in_turn][:_MOST_NAMES]:
+        is_line = p.kind in (Kind.TRIVIAL, Kind.FLOOR)
+        at = (left if is_line else p.milliseconds, ranks[p.name].mean)
+        colour = _LINES[p.kind]["color"] if is_line else _MARKERS[p.kind, p.of_other_scenes]["color"]
+        for offset, side, level in _LINE_SPOTS if is_line else _SPOTS:
+            text = axes.annotate(
+                _short_name(p), at, offset, textcoords="offset points", ha=side, va=level, color=colour,
+                fontsize="small", arrowprops=None if is_line else {"arrowstyle": "-", "color": "0.7", "lw": 0.6},
+            )  # fmt: skip
+            box = _text_box(text)
+            if np.array_equal(Bbox.union([inside, box]), inside) and not box.count_overlaps(taken):
+                taken.append(box)
+                break
+            text.remove()
+
+
+def _text_box(text: Any) -> Any:
+    """The box of an annotation's letters in pixels, without its arrow."""
+    text.update_positions(text.figure.canvas.get_renderer())
+    return Text.get_window_extent(text)
+
+
+def _places(points: Sequence[Point], ranks: Mapping[str, Rank]) -> list[tuple[float, float]]:
+    return [(p.milliseconds, ranks[p.name].mean) for p in points]
+
+
+def _short_name(point: Point) -> str:
+    short = point.name.removeprefix("simulator, ").replace(OTHER_SCENES, "")
+    return short.replace(" resolution", "").replace("bfloat16", "bf16")
 
 
 def draw_curves(path: Path, points: Sequence[Point], scenes: Scenes) -> None:
@@ -189,4 +247,4 @@ def _figure(width: float, height: float, dpi: int = 130) -> Figure:
 
 def _save(figure: Figure, path: Path) -> None:
     with atomic_write(path) as part:
-        figure.savefig(part, format="png")
+        figure.savefig(part, format=path.suffix[1:])

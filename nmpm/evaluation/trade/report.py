@@ -16,22 +16,26 @@ from rich.table import Table
 from nmpm._support.atomic import atomic_write
 from nmpm.evaluation.bootstrap import interval
 from nmpm.evaluation.figures import Unit
-from nmpm.evaluation.trade.charts import draw_chart, draw_curves, draw_frames
+from nmpm.evaluation.trade.charts import draw_chart, draw_curves, draw_frames, draw_styled_chart
 from nmpm.evaluation.trade.choices import Kind
 from nmpm.evaluation.trade.ranking import Point, beside_simulator, measure_names, rank, recommend
 from nmpm.evaluation.trade.scenes import Scenes
+from nmpm.viz.output import PictureStyle
 
 _SETTINGS = ("model", "weights", "precision", "constraints", "cells", "coarser", "substeps", "nudge", "runtime")
 _NAME = 12  # least width of the names in a terminal
 _LIKELY = 0.05  # probability from which on a point may be in the Pareto set
 
 
-def write_report(folder: Path, name: str, points: Sequence[Point], scenes: Scenes) -> list[Path]:
+def write_report(
+    folder: Path, name: str, points: Sequence[Point], scenes: Scenes, style: PictureStyle | None = None
+) -> list[Path]:
     """Write all files of the report into a folder, which is made if it is missing.
 
     These are NAME.csv, one row for each point and error; NAME.json, all figures of every scene; NAME.md, the table of
-    all points and the sentences; NAME.png, time and error; errors.png and frames.png, see `charts.py`. Pictures are
-    left out where nothing is stable, and frames.png of scenes in one dimension.
+    all points and the sentences; NAME.png, time and error, and for a style the same as SVG or PDF; errors.png and
+    frames.png, see `charts.py`. Pictures are left out where nothing is stable, and frames.png of scenes in one
+    dimension.
     """
     folder.mkdir(parents=True, exist_ok=True)
     plain = json.dumps(describe(points, scenes), indent=1, ensure_ascii=False) + "\n"
@@ -46,6 +50,9 @@ def write_report(folder: Path, name: str, points: Sequence[Point], scenes: Scene
         for file, draw in pictures.items():
             draw(folder / file, points, scenes)
         paths += [folder / file for file in pictures]
+        if style is not None:
+            draw_styled_chart(paths[-1].with_name(name + style.suffix), points, scenes, style)
+            paths.append(paths[-1].with_name(name + style.suffix))
     return paths
 
 

@@ -37,7 +37,7 @@ const FLAT = `#version 300 es
 precision highp float; uniform vec4 plain; out vec4 pixel; void main() { pixel = plain; }`;
 const MODES = { material: 0, speed: 1, error: 2, plain: 3, field: 4 };
 /** Diameter of a disc in spacings: above √2, from which on the discs of a square lattice leave no gaps. */
-const DISC_DIAMETER = 1.55;
+const DISC_DIAMETER = 1.7;
 const FLOOR_TILES = 10;
 /** Which positions besides the particles' own a mode reads: 1 of the frame before, 2 of the reference. */
 const OTHERS = { [MODES.speed]: 1, [MODES.error]: 2 };
@@ -130,7 +130,7 @@ class Drawing {
 
   /**
    * Draws particles at a frame.
-   * @param look {mode, top, plain, diameter, field, opacity, stride}: see the shader; top in domain lengths, field of all
+   * @param look {mode, top, plain, diameter, field, opacity, stride, flat}: see the shader; top in domain lengths, field of all
    *   frames; the trajectory has each stride-th particle of the reference (1 if left out).
    */
   drawFrame(trajectory, reference, frame, view, look) {
@@ -195,7 +195,7 @@ class Drawing {
     gl.uniform1f(at("top"), look.top);
     gl.uniform1f(at("opacity"), opacity);
     gl.uniform1i(at("mode"), look.mode);
-    gl.uniform1i(at("ball"), dim === 3);
+    gl.uniform1i(at("ball"), dim === 3 && !look.flat);
     gl.drawArrays(gl.POINTS, 0, count);
     gl.depthMask(true);
   }

@@ -46,10 +46,19 @@ class Camera {
       rows.map((row) => row.reduce((sum, value, axis) => sum + value * corner[axis], 0)));
   }
 
-  /** The least distance from which the whole box is seen. */
-  distance(width, height) {
-    return Math.max(...this.corners().map(([right, up, toward]) =>
-      toward + Math.max((Math.abs(right) * height) / width, Math.abs(up)) / (ORBIT.filled * Math.tan(ORBIT.halfAngle))));
+  /** The least distance from which the whole box is seen, and how far its middle then is above the panel's. */
+  fit(width, height) {
+    const corners = this.corners(), size = Math.hypot(...this.sizes), slope = Math.tan(ORBIT.halfAngle);
+    let [near, far, shift] = [size / 2, 100 * size, 0];
+    for (let i = 0; i < 30; i++) {
+      const distance = (near + far) / 2;
+      const ends = (axis, side) => corners.map((corner) => corner[axis] / (distance - corner[2]) / slope / side);
+      const [across, along] = [ends(0, width / height), ends(1, 1)], [low, high] = [Math.min(...along), Math.max(...along)];
+      const fits = Math.max(...across.map(Math.abs), (high - low) / 2) < ORBIT.filled;
+      if (fits) [far, shift] = [distance, (low + high) / 2];
+      else near = distance;
+    }
+    return { distance: far, shift };
   }
 
   /** Pixels to a unit of length, in 2-D. */
@@ -64,8 +73,9 @@ class Camera {
       const scale = this.scale(width, height);
       return { matrix: flatView(this.centre, scale, width, height), unit: scale };
     }
-    const size = Math.hypot(...this.sizes), distance = this.distance(width, height) / this.zoom;
-    const matrix = orbitView(this.centre, scene.up, this.turn, this.tilt, distance, size, width, height);
+    const { distance, shift } = this.fit(width, height), size = Math.hypot(...this.sizes);
+    const matrix = orbitView(this.centre, scene.up, this.turn, this.tilt, distance / this.zoom, size, width, height);
+    for (let column = 0; column < 4; column++) matrix[4 * column + 1] -= shift * matrix[4 * column + 3];
     return { matrix, unit: height / (2 * Math.tan(ORBIT.halfAngle)) };
   }
 

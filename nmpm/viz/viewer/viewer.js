@@ -214,7 +214,7 @@ class Viewer {
   /** On the floor, straight below the particles. */
   drawShadow(index, matrix, look) {
     if (this.camera.tilt < 0) return;
-    const shadow = { ...look, mode: MODES.plain, plain: [...this.theme.wall, 1] }, flat = flatten(scene.up, scene.bounds[scene.up][0]);
+    const shadow = { ...look, flat: true, mode: MODES.plain, plain: [...this.theme.wall, 1] }, flat = flatten(scene.up, scene.bounds[scene.up][0]);
     this.drawing.drawFrame(this.trajectories[index], this.trajectories[0], this.frame, multiply(matrix, flat), shadow);
     this.drawing.gl.clear(this.drawing.gl.DEPTH_BUFFER_BIT);
   }

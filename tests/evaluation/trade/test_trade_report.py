@@ -1,12 +1,14 @@
 """The report: tidy CSV, JSON and table that state the same figures, and pictures."""
 
 import csv
+import itertools
 import json
 
 import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from PIL import Image
 
 from nmpm._support.digests import short_digest
@@ -20,8 +22,10 @@ from nmpm.evaluation.trade.report import (
     markdown_text,
     report_lines,
     summary_table,
+    write_report,
 )
 from nmpm.scene import Scene
+from nmpm.viz.output import STYLES
 from tests.evaluation.trade.made_up import point, tiny_emulator, tiny_sweep
 
 
@@ -71,12 +75,18 @@ def test_failures_and_what_differs_from_training_are_said():
     assert lines[-1] == "bad: unstable in 1 scenes, first in scene 1: gains 30% of energy"
 
 
-def test_kinds_are_drawn_apart_and_names_stay_inside(tmp_path, monkeypatch):
-    drawn = []
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that are saved."""
+    figures = []
     save = Figure.savefig
     monkeypatch.setattr(
-        Figure, "savefig", lambda figure, *args, **kwargs: (drawn.append(figure), save(figure, *args, **kwargs))
+        Figure, "savefig", lambda figure, *args, **kwargs: (figures.append(figure), save(figure, *args, **kwargs))
     )
+    return figures
+
+
+def test_kinds_are_drawn_apart_and_names_stay_inside(tmp_path, drawn):
     points = [
         point("simulator, 12 substeps", Kind.SIMULATOR, 8.0, (0.0, 0.0)),
         point("simulator, 6 substeps", Kind.SIMULATOR, 4.0, (0.4, 0.6), substeps=6),
@@ -100,6 +110,28 @@ def test_kinds_are_drawn_apart_and_names_stay_inside(tmp_path, monkeypatch):
     inside = axes.get_window_extent()
     names = {text.get_text().strip(): text.get_window_extent() for text in axes.texts}
     assert set(names) - {""} == {
-        "6 substeps", "ours", "theirs", "a graph", "nothing moves", "twin: 6 of 12 substeps",
+        "better", "6 substeps", "ours", "theirs", "a graph", "nothing moves", "twin: 6 of 12 substeps",
     }  # fmt: skip
     assert all(inside.x0 - 1 <= box.x0 and box.x1 <= inside.x1 + 1 for name, box in names.items() if name)
+
+
+def test_at_most_ten_names_are_written_and_none_over_another(tmp_path, drawn):
+    rng = np.random.default_rng(0)
+    points = [
+        point(f"a model with number {number}", time=time, errors=(error, error))
+        for number, (time, error) in enumerate(rng.uniform(1, 2, size=(40, 2)))
+    ]
+    draw_chart(tmp_path / "trade.png", points, made_up_scenes())
+    boxes = [Text.get_window_extent(text) for text in drawn[0].axes[0].texts]
+    assert 5 < len(boxes) <= 11  # with "better"
+    assert not any(one.overlaps(other) for one, other in itertools.combinations(boxes, 2))
+    (frontier,) = (line for line in drawn[0].axes[0].lines if line.get_label() == "frontier")
+    assert np.all(np.diff(frontier.get_xdata()) > 0)
+    assert np.all(np.diff(frontier.get_ydata()) < 0)
+
+
+def test_a_style_adds_the_chart_in_its_format(tmp_path):
+    points = [point("ours", errors=(0.8, 1.2), model="ours"), point("theirs", time=3.0, errors=(0.4, 0.5))]
+    for name, start in (("talk", b"<?xml"), ("paper", b"%PDF")):
+        *_, path = write_report(tmp_path, "trade", points, made_up_scenes(), STYLES[name])
+        assert path.read_bytes().startswith(start)
