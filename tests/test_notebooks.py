@@ -15,6 +15,8 @@ import matplotlib.pyplot as plt
 import pytest
 from PIL import Image
 
+from nmpm import Zoo
+
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 PUBLIC = (
     "nmpm",
@@ -36,6 +38,7 @@ BUDGETS: dict[str, dict[str, object]] = {
     "your_own_data": {"RUNS, FRAMES, PARTICLES": (4, 60, 60), "STEPS": 2},
 }
 """Constants of the notebooks, by what they are here; only how much is computed changes."""
+LOADED = re.compile(r'Zoo\.load\("([\w/-]+)"(?:, variant="(\w+)")?')
 if not NOTEBOOKS.is_dir():
     pytest.skip("notebooks are not part of this distribution", allow_module_level=True)
 
@@ -112,6 +115,14 @@ def test_notebooks_are_stored_as_one_run_left_them(path):
     assert path.stat().st_size < 1_000_000
     texts = [str(output.get("text") or output.get("data", {}).get("text/plain")) for output in outputs]
     assert not re.search(r"Warning|Traceback|/home/|/root/|/tmp/|site-packages", "\n".join(texts))
+
+
+@every_notebook
+def test_notebooks_are_stored_as_the_shipped_weights_left_them(path):
+    """Outputs belong to weights: after a training, `python benchmarks/run_notebooks.py` runs them again."""
+    names = {"/".join(filter(None, match)) for match in LOADED.findall("\n".join(read_code(path)))} & set(Zoo.list())
+    shipped = {name: Zoo.card(name)["sha256"][:12] for name in names}
+    assert json.loads(path.read_text(encoding="utf-8"))["metadata"]["weights"] == shipped
 
 
 def test_quickstart_predicts_a_scene_and_leaves_pictures(run):

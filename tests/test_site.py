@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from nmpm import Zoo
+
 ROOT = Path(__file__).parent.parent
 PAGES = [
     path
@@ -57,6 +59,7 @@ def build(folder: Path) -> None:
     """Builds the site; warnings are errors."""
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1", "PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "40"}
+    environment["NMPM_GALLERY_FRAMES"] = "8"
     run = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
         cwd=ROOT,
@@ -82,6 +85,13 @@ def test_the_site_builds_and_fetches_nothing(tmp_path):
     for name, page in pages.items():
         assert FETCHED.search(page) is None, name
     assert all(f'id="nmpm.processors.{name}"' in pages["reference/nmpm.processors.html"] for name in ("UNet", "FNO"))
+    assert all(
+        (tmp_path / "gallery" / f"{name.replace('/', '-')}.html").stat().st_size < 1_500_000 for name in Zoo.list()
+    )
+    assert 'src="quickstart-1.png"' in pages["notebooks/quickstart.html"]
+    assert 'rel="next"' in pages["zoo/goop/index.html"]
+    first = [pages["reference/nmpm.html"].index(f'id="nmpm.{name}"') for name in ("Zoo", "rollout", "Emulator")]
+    assert first == sorted(first)
     commands = html.unescape(pages["reference/commands.html"])
     assert all(option in commands for option in ("--shard I/N", "--full", "--private", "usage: nmpm zoo match"))
     concepts = pages["concepts.html"]

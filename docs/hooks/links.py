@@ -20,14 +20,13 @@ LINK = re.compile(r"\[(?P<text>(?:[^\[\]]|\[[^\]]*\])*)\]\((?!\w+:|#)(?P<target>
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Rewrites the relative links of a page that is a file of the repository."""
-    if page.file.abs_src_path is None:
-        return markdown
-    source, here = Path(page.file.abs_src_path).parent, os.path.dirname(page.file.src_uri)
+    """Rewrites the relative links of a page; those to notebooks go to their pages."""
+    here = os.path.dirname(page.file.src_uri)
+    source = ROOT / here if page.file.abs_src_path is None else Path(page.file.abs_src_path).parent
 
     def rewrite(link: re.Match[str]) -> str:
         target = Path(os.path.normpath(source / link["target"]))
-        path = site_path(target, Path(config.docs_dir))
+        path = re.sub(r"\.ipynb$", ".md", site_path(target, Path(config.docs_dir)))
         if target.exists() and files.get_file_from_path(path) is None:
             return link["text"]
         return f"[{link['text']}]({os.path.relpath(path, here or '.')}{link['anchor'] or ''})"

@@ -11,6 +11,7 @@ import contextlib
 import io
 import os
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -47,6 +48,17 @@ ROOMS = (
     "nmpm.testing",
     "nmpm.errors",
 )
+
+
+FIRST = {"nmpm": ("Zoo", "rollout", "EmulatorModule", "TrajectoryDataModule")}
+"""What users need first, by room."""
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Adds the zoo's models to the navigation, so that each page leads to the next."""
+    models = next(item["Models"] for item in config.nav or [] if "Models" in item)
+    models += [path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "zoo").glob("*/**/README.md"))]
+    return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -142,8 +154,17 @@ def _table(rows: Sequence[rules.Rule[Any]], columns: Sequence[str]) -> str:
 
 
 def room_page(room: str) -> str:
-    """Public names of a room of the package, for mkdocstrings."""
-    return f"# {room}\n\n::: {room}\n"
+    """Public names of a room of the package, for mkdocstrings; those of `FIRST` before the others."""
+    names = [name for name in FIRST.get(room, ()) if name in public_names(room)]
+    if not names:
+        return f"# {room}\n\n::: {room}\n"
+    listed = "\n".join(f"        - {name}" for name in [*names, *(n for n in public_names(room) if n not in names)])
+    return f"# {room}\n\n::: {room}\n    options:\n      members_order: __all__\n      members:\n{listed}\n"
+
+
+def public_names(room: str) -> list[str]:
+    """The names of a room's `__all__`."""
+    return [name for name in import_module(room).__all__ if not name.startswith("_")]
 
 
 def _training(summary: str) -> str:

@@ -1,0 +1,44 @@
+"""Run notebooks in empty folders and store their outputs, with the digests of the zoo's weights that they load.
+
+python benchmarks/run_notebooks.py notebooks/quickstart.ipynb …
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+import tempfile
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+from timing import make_parser
+
+from nmpm import Zoo
+
+LOAD = re.compile(r'Zoo\.load\("([\w/-]+)"(?:, variant="(\w+)")?')
+
+
+def main() -> None:
+    """Run the notebooks one after the other."""
+    parser = make_parser(__doc__)
+    parser.add_argument("notebooks", nargs="+", type=Path)
+    for path in parser.parse_args().notebooks:
+        notebook = nbformat.read(path, as_version=4)
+        with tempfile.TemporaryDirectory() as folder:
+            NotebookClient(notebook, timeout=None, resources={"metadata": {"path": folder}}).execute()
+        notebook.metadata["weights"] = digests("\n".join(cell.source for cell in notebook.cells))
+        for cell in notebook.cells:
+            cell.metadata.pop("execution", None)  # times of this run
+        nbformat.write(notebook, path)
+        sys.stdout.write(f"wrote {path}\n")
+
+
+def digests(code: str) -> dict[str, str]:
+    """The beginning of the SHA-256 of the weights of each shipped model that the code loads."""
+    names = {"/".join(filter(None, match)) for match in LOAD.findall(code)} & set(Zoo.list())
+    return {name: Zoo.card(name)["sha256"][:12] for name in sorted(names)}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,49 @@
+"""MkDocs hook: a page of the zoo's models, each with a player of a rollout that is computed when the site is built."""
+
+from __future__ import annotations
+
+import numpy as np
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+from nmpm import Zoo
+from nmpm.viz import LabelledTrajectories
+from nmpm.viz.viewer import ViewerPage
+
+VALUES = 500_000  # coordinates of a page, which then has about a megabyte
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Adds the page and its players."""
+    names, frames = Zoo.list(), int(config.extra["gallery_frames"])
+    for name in names:
+        files.append(File.generated(config, f"gallery/{_file(name)}", content=player(name, frames)))
+    files.append(File.generated(config, "gallery.md", content=page(names)))
+    return files
+
+
+def page(names: list[str]) -> str:
+    """The gallery, as Markdown."""
+    parts = [
+        f"## {name}\n\n[Its card](zoo/{name}/README.md)\n\n"
+        f'<iframe src="gallery/{_file(name)}" title="{name}" loading="lazy" class="player"></iframe>'
+        for name in names
+    ]
+    head = "# Gallery\n\nA rollout of each model, from a scene of its own kind that it has not seen; `nmpm demo NAME`"
+    return "\n\n".join([f"{head} sets the\nsimulator beside it, `nmpm play NAME` lets you interfere.", *parts]) + "\n"
+
+
+def player(name: str, frames: int) -> str:
+    """The viewer's page of a rollout."""
+    model = Zoo.load(name)
+    state = model.example(seed=1)
+    positions = np.concatenate([state.position[:, None], model.rollout(state, frames)], axis=1)[0]
+    obstacle = None if state.obstacle is None else state.obstacle[0].numpy()
+    trajectories = LabelledTrajectories.from_scene(
+        model.scene, {name: positions}, state.material[0].numpy(), obstacle, title=name
+    )
+    return ViewerPage(trajectories, every=max(1, -(-positions.size // VALUES))).html
+
+
+def _file(name: str) -> str:
+    return f"{name.replace('/', '-')}.html"
