@@ -159,8 +159,16 @@ def test_an_ensemble_is_drawn_as_points_or_density_or_one_member(open_page):
     assert "10, 50, 90% of 4 members" not in page.locator("#legend").inner_text()
     page.select_option("#members", "density")
     assert "10, 50, 90% of 4 members" in page.locator("#legend").inner_text()
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_the_density_counts_the_particles_of_each_member_that_are_on_the_page(open_page, monkeypatch, stride):
+    monkeypatch.setattr("nmpm.viz.viewer.page.MEMBER_BYTES", 2 * 6 * 60 * 2 * 3 // stride)
+    ensemble = shown_ensemble()
+    page = open_page(ensemble)
+    assert page.evaluate("scene.bands.stride") == stride
     density = page.evaluate("({ shares: [...viewer.ensemble.density.share(5)], cells: viewer.ensemble.density.cells })")
-    last = [member[5] for member in ensemble.members.values()]
+    last = [member[5, ::stride] for member in ensemble.members.values()]
     expected = occupied_share(last, np.zeros(2), page.evaluate("scene.bands.cell"), tuple(density["cells"]))
     difference = np.reshape(density["shares"], expected.shape[::-1]).T - expected
     assert (np.abs(difference) > 1e-6).mean() < 0.01  # rounding moves few particles to another cell

@@ -21,9 +21,9 @@ void main() {
 }`;
 
 class Density {
-  /** @param members 16-bit positions of each member; @param strides in which of them each n-th particle counts. */
-  constructor(gl, members, strides) {
-    Object.assign(this, { gl, members, strides });
+  /** @param members 16-bit positions: of the first all, of the others each n-th; in all of them each n-th counts. */
+  constructor(gl, members) {
+    Object.assign(this, { gl, members });
     this.bands = compile(gl, COVER, BANDS, ["position"]);
     this.low = scene.bounds.map(([low]) => low);
     this.cells = scene.bounds.map(([low, high]) => Math.ceil((high - low) / scene.bands.cell));
@@ -40,8 +40,8 @@ class Density {
   share(frame) {
     const [columns, rows] = this.cells, sum = new Float32Array(columns * rows);
     this.members.forEach((positions, index) => {
-      const own = this.occupied(positions, frame, this.strides[index]);
-      own.forEach((value, at) => (sum[at] += Math.min(1, value) / this.members.length));
+      const cells = this.occupied(positions, frame, index ? 1 : scene.bands.stride);
+      cells.forEach((value, at) => (sum[at] += Math.min(1, value) / this.members.length));
     });
     return sum;
   }

@@ -8,7 +8,7 @@ class Ensemble {
     this.members = [shown, ...further];
     this.labels = [scene.trajectories[this.index].label, ...scene.members.map(({ label }) => label)];
     this.strides = this.members.map((_, number) => (number ? scene.bands.stride : 1));
-    if (scene.dim === 2) this.density = new Density(drawing.gl, this.members, this.strides.map(() => scene.bands.stride));
+    if (scene.dim === 2) this.density = new Density(drawing.gl, this.members);
     this.fillChoices();
   }
 
