@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from jsonargparse.typing import PositiveInt
 from lightning.fabric.plugins.io import TorchCheckpointIO
 from lightning.pytorch import Trainer
-from lightning.pytorch.callbacks import BatchSizeFinder, LearningRateMonitor, ModelCheckpoint, ProgressBar
+from lightning.pytorch.callbacks import BatchSizeFinder, LearningRateMonitor, ProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
@@ -35,20 +35,15 @@ from nmpm.training.callbacks.divergence import DivergenceGuard
 from nmpm.training.callbacks.forecast import Forecast
 from nmpm.training.callbacks.outputs import PredictionWriter, ReportWriter
 from nmpm.training.callbacks.progress import Progress
-from nmpm.training.callbacks.savers import BestCheckpoint, LastCheckpoint
+from nmpm.training.callbacks.savers import DEFAULTS, BestCheckpoint, LastCheckpoint
 from nmpm.training.callbacks.threads import Threads
 from nmpm.training.checkpoints import AtomicCheckpointIO, read_checkpoint
 from nmpm.training.module import EmulatorModule
 from nmpm.training.optimization import check_learning_rate
-from nmpm.training.preflight import OVERALL, check_disk, check_memory, fitting_precision
+from nmpm.training.preflight import check_disk, check_memory, fitting_precision
 
 T = TypeVar("T")
 
-# Two savers, as ModelCheckpoint's `save_last` leaves the last checkpoint as it was whenever the best does not change.
-SAVER_DEFAULTS: dict[str, tuple[type[ModelCheckpoint], dict[str, Any]]] = {
-    "best": (BestCheckpoint, {"monitor": f"valid/{OVERALL}"}),
-    "last": (LastCheckpoint, {"every_n_train_steps": 100}),
-}
 THREADS = (
     "Of a CPU, which compute parts of a batch (default: OMP_NUM_THREADS; else the faster of one and all that may be"
     " used, as measured). Another number changes results by rounding."
@@ -80,7 +75,7 @@ class EmulatorCLI(LightningCLI):
         return parser
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        for name, (kind, defaults) in SAVER_DEFAULTS.items():
+        for name, (kind, defaults) in DEFAULTS.items():
             parser.add_lightning_class_args(kind, SAVERS[name])
             given = defaults | {"filename": name, "enable_version_counter": False}
             parser.set_defaults({f"{SAVERS[name]}.{key}": value for key, value in given.items()})

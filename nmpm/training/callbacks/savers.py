@@ -19,6 +19,7 @@ from torch import Tensor
 from nmpm._support.collectives import any_rank
 from nmpm.errors import DataError
 from nmpm.training.checkpoints import read_checkpoint
+from nmpm.training.preflight import OVERALL
 
 RANKS_AGREE_EVERY = 16
 """Steps between exchanges of several ranks, which read back from the device."""
@@ -213,3 +214,10 @@ def _is_last_step(trainer: Trainer) -> bool:
         or trainer.should_stop
         or (last_epoch and loop._num_ready_batches_reached())
     )
+
+
+# Two savers, as ModelCheckpoint's `save_last` leaves the last checkpoint as it was whenever the best does not change.
+DEFAULTS: dict[str, tuple[type[ModelCheckpoint], dict[str, Any]]] = {
+    "best": (BestCheckpoint, {"monitor": f"valid/{OVERALL}"}),
+    "last": (LastCheckpoint, {"every_n_train_steps": 100}),
+}
