@@ -36,18 +36,13 @@ from nmpm.training.callbacks.forecast import Forecast
 from nmpm.training.callbacks.outputs import PredictionWriter, ReportWriter
 from nmpm.training.callbacks.progress import Progress
 from nmpm.training.callbacks.savers import DEFAULTS, BestCheckpoint, LastCheckpoint
-from nmpm.training.callbacks.threads import Threads
+from nmpm.training.callbacks.threads import THREADS, Threads
 from nmpm.training.checkpoints import AtomicCheckpointIO, read_checkpoint
 from nmpm.training.module import EmulatorModule
 from nmpm.training.optimization import check_learning_rate
 from nmpm.training.preflight import check_disk, check_memory, fitting_precision
 
 T = TypeVar("T")
-
-THREADS = (
-    "Of a CPU, which compute parts of a batch (default: OMP_NUM_THREADS; else the faster of one and all that may be"
-    " used, as measured). Another number changes results by rounding."
-)
 
 
 class EmulatorCLI(LightningCLI):

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from nmpm._support.numbers import is_finite
+from nmpm._support.numbers import check_whole, is_finite
 from nmpm.emulator.members import stream_members
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor
@@ -254,3 +254,24 @@ def calibrate(emulator: Emulator, windows: Iterable[Window]) -> Trust:
         members.append(beside.curve[0])
         truth.append(apart.curve[0])
     return Trust.fit(members, truth)
+
+
+def predict_trusted(
+    emulator: Emulator,
+    trust: Trust,
+    state: Particles,
+    frames: int,
+    prescribed: Prescribed | None = None,
+    members: int | None = None,
+    seed: int = 0,
+    nudge: float | None = None,
+) -> Rollout:
+    """Predict as `predict_rollout`, or `predict_members`, up to the last trusted frame of any scene.
+
+    Positions of scenes that are lost before others are NaN from then on; `trusted` (B,) says when.
+    """
+    check_whole("frames", frames, 1)
+    tracker = TrustTracker(emulator.scene, state, trust)
+    watched = stream_watched(emulator, state, frames, tracker, members, seed, nudge, prescribed)
+    made = Rollout.join(list(until_trusted(watched, tracker)))._replace(trusted=tracker.frames)
+    return made if members is None else made.by_member(members)

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nmpm._support.numbers import check_whole
-from nmpm.emulator import Emulator, Prescribed, Rollout
-from nmpm.emulator.trust import Trust, TrustTracker, stream_watched, until_trusted
+from nmpm.emulator import Emulator, Rollout
+from nmpm.emulator.trust import Trust, predict_trusted
 from nmpm.errors import ConfigError, UnstableError
 from nmpm.particles import Particles
 from nmpm.scene import Interval, Scene
-from nmpm.sim import InitialState, Preset
+from nmpm.sim import InitialState, Preset, load_preset
 from nmpm.sim.mpm.mixture import MpmMixture
 from nmpm.sim.state import Array, Progress
 
@@ -31,29 +31,11 @@ _LONGEST_RATIO = 64
 """Largest denominator of the ratio between the frames of model and preset."""
 
 
-def predict_trusted(
-    emulator: Emulator,
-    trust: Trust,
-    state: Particles,
-    frames: int,
-    prescribed: Prescribed | None = None,
-    members: int | None = None,
-    seed: int = 0,
-    nudge: float | None = None,
+def predict_and_simulate(
+    emulator: Emulator, trust: Trust, state: Particles, frames: int, preset: Preset | str | Path
 ) -> Rollout:
-    """Predict as `predict_rollout`, or `predict_members`, up to the last trusted frame of any scene.
-
-    Positions of scenes that are lost before others are NaN from then on; `trusted` (B,) says when.
-    """
-    check_whole("frames", frames, 1)
-    tracker = TrustTracker(emulator.scene, state, trust)
-    watched = stream_watched(emulator, state, frames, tracker, members, seed, nudge, prescribed)
-    made = Rollout.join(list(until_trusted(watched, tracker)))._replace(trusted=tracker.frames)
-    return made if members is None else made.by_member(members)
-
-
-def predict_and_simulate(emulator: Emulator, trust: Trust, state: Particles, frames: int, preset: Preset) -> Rollout:
-    """Predict up to each scene's last trusted frame, `trusted` (B,), and simulate the rest by a preset."""
+    """Predict up to each scene's last trusted frame, `trusted` (B,), and simulate the rest by a preset, or its name."""
+    preset = preset if isinstance(preset, Preset) else load_preset(preset)
     preset = fitting_preset(emulator.scene, state, preset)
     trusted = predict_trusted(emulator, trust, state, frames)
     return simulate_rest(emulator.scene, state, trusted, preset, frames)

@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torch import Tensor
 
 from nmpm.emulator import Emulator, Prescribed, Rollout, differentiable_rollout, predict_rollout
 from nmpm.emulator.input_checks import warn_of_start_outside
 from nmpm.emulator.members import nudge_of, predict_members
-from nmpm.emulator.trust import Trust
+from nmpm.emulator.trust import Trust, predict_trusted
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
-from nmpm.sim import Preset, load_preset
 from nmpm.zoo.card import stated_nudge
-from nmpm.zoo.fallback import predict_and_simulate, predict_trusted
+
+if TYPE_CHECKING:
+    from nmpm.sim import Preset
 
 TRUSTED = "trusted"
 """Says `until` that a rollout ends with the last trusted frame."""
@@ -93,8 +94,9 @@ class Predictor:
         warn_of_start_outside(self.emulator, there)
         size = self.nudge if nudge is None else nudge
         if fallback is not None:
-            preset = fallback if isinstance(fallback, Preset) else load_preset(fallback)
-            return predict_and_simulate(self.emulator, self.trust, there, frames, preset)
+            from nmpm.zoo.fallback import predict_and_simulate  # imported late, as it imports simulators
+
+            return predict_and_simulate(self.emulator, self.trust, there, frames, fallback)
         if until is not None:
             return predict_trusted(self.emulator, self.trust, there, frames, given, members, seed, size)
         if members is not None:

@@ -13,6 +13,12 @@ from nmpm.particles import Window
 from nmpm.training.backpropagation import MOST_PARTS
 from nmpm.training.module import EmulatorModule
 
+THREADS = (
+    "Of a CPU, which compute parts of a batch (default: OMP_NUM_THREADS; else the faster of one and all that may be"
+    " used, as measured). Another number changes results by rounding."
+)
+"""Help of the option."""
+
 
 class Threads(Callback):
     """Splits batches in as many parts as there are cores, and measures whether one thread is faster than all.
