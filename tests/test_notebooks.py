@@ -118,10 +118,8 @@ def test_notebooks_are_stored_as_one_run_left_them(path):
 
 
 @every_notebook
-def test_notebooks_are_stored_as_the_shipped_weights_left_them(path, request):
+def test_notebooks_are_stored_as_the_shipped_weights_left_them(path):
     """Outputs belong to weights: after a training, `python benchmarks/run_notebooks.py` runs them again."""
-    if path.stem == "inverse_design":
-        request.applymarker(pytest.mark.xfail(reason="stored before the last training of waterramps", strict=True))
     names = {"/".join(filter(None, match)) for match in LOADED.findall("\n".join(read_code(path)))} & set(Zoo.list())
     shipped = {name: Zoo.card(name)["sha256"][:12] for name in names}
     assert json.loads(path.read_text(encoding="utf-8"))["metadata"].get("weights") == shipped
