@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -97,3 +98,9 @@ class Recording:
             like = next(row for row in rows if row is not None)
             columns.append(torch.stack([torch.full_like(like, torch.nan) if row is None else row for row in rows]))
         return torch.cat(columns, dim=1).reshape(length, -1, static.shape[-1])
+
+
+def free_name(path: Path) -> Path:
+    """The path, or with the first number for which there is no file."""
+    numbered = (path.with_stem(f"{path.stem}-{number}") for number in range(2, 10_000))
+    return next(name for name in (path, *numbered) if not name.exists())

@@ -27,7 +27,7 @@ from nmpm.play.messages import read_command
 from nmpm.play.placing import block, with_room
 from nmpm.play.pouring import Jet
 from nmpm.play.pushing import ANGLE, Movable, moved, new_body, push
-from nmpm.play.recording import Recording
+from nmpm.play.recording import Recording, free_name
 from nmpm.play.start import simulator_of, start_of
 from nmpm.play.world import World
 from nmpm.zoo.states import StateBuilder
@@ -188,7 +188,7 @@ class Session:
     def save(self) -> None:
         model, world = f"the model {self.model.name}, played with", self.world
         made = self.recording.trajectory(self.scene, world.material, world.now().gravity, world.static, model)
-        path = _free_name(self.out)
+        path = free_name(self.out)
         write_trajectory(path, made, described_metadata(made.attributes, path, len(made.position)))
         lost = f", without the first {self.recording.forgotten}" if self.recording.forgotten else ""
         self.say(f"wrote {len(made.position)} frames{lost} to {path}: nmpm view {path}", "news")
@@ -295,9 +295,3 @@ class Session:
     def _sent(self) -> list[Message]:
         sent, self._outbox = self._outbox, []
         return sent
-
-
-def _free_name(path: Path) -> Path:
-    """The path, or with the first number for which there is no file."""
-    numbered = (path.with_stem(f"{path.stem}-{number}") for number in range(2, 10_000))
-    return next(name for name in (path, *numbered) if not name.exists())
