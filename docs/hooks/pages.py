@@ -159,7 +159,8 @@ def room_page(room: str) -> str:
     if not names:
         return f"# {room}\n\n::: {room}\n"
     listed = "\n".join(f"        - {name}" for name in [*names, *(n for n in public_names(room) if n not in names)])
-    return f"# {room}\n\n::: {room}\n    options:\n      members_order: __all__\n      members:\n{listed}\n"
+    options = f"group_by_category: false\n      members_order: __all__\n      members:\n{listed}"
+    return f"# {room}\n\n::: {room}\n    options:\n      {options}\n"
 
 
 def public_names(room: str) -> list[str]:

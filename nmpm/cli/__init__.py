@@ -44,7 +44,7 @@ commands:
 {commands}
 
 first steps:
-  nmpm demo                                    a simulator and its emulator, side by side in a browser
+  nmpm demo                                    a simulator and its emulator, side by side
   nmpm fit --config goop.yaml                  simulate the goop dataset, train on it, test, draw
   nmpm fit --resume runs/goop                  go on after an interruption
   nmpm inspect FOLDER                          summarise recorded data of any format known

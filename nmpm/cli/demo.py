@@ -27,7 +27,7 @@ FRAMES = 200
 
 _EXAMPLES = """\
 examples:
-  nmpm demo                                a dam break: the simulator, and a model that learned from it
+  nmpm demo                                a dam break: the simulator, and its model
   nmpm demo waterramps --seed 3            water and ramps, another scene
   nmpm demo goop --frames 400 --out goop   goop.h5 and goop.html
 """

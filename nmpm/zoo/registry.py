@@ -220,8 +220,8 @@ def _unknown_model(name: str, root: Root = None) -> ZooError:
     else:
         near = suggestion(name[:NAME_LENGTH], sorted({*names, *datasets.values()}))
     path = " No such path exists either." if root is None and not _exists(Path(name)) else ""
-    shown = one_line(repr(name), NAME_LENGTH)
-    return ZooError(f"The zoo holds no model {shown}; it holds {', '.join(names) or 'none'}.{near}{path}")
+    shown, held = one_line(repr(name), NAME_LENGTH), sorted(set(datasets.values()))
+    return ZooError(f"The zoo holds no model {shown}; it holds {', '.join(held) or 'none'}.{near}{path}")
 
 
 def _is_name(name: str) -> bool:

@@ -86,7 +86,7 @@ def test_a_rollout_makes_frames_between_those_of_the_data_or_jumps_over_some(cap
     assert main(["rollout", "goop", "--data", str(data), "--out", "quarter.h5"]) == 0
     said = capsys.readouterr().out
     assert "1 frame of the model = 1/4 of the data" in said
-    assert "120 frames; most" in said
+    assert "120 frames. At most" in said
     written = Split(Path("quarter.h5"))
     assert written.frames(0) == 32
     assert read_metadata(data).dt == json.loads(written.read(0).attributes["scene"])["dt"] == 10.0

@@ -34,6 +34,7 @@ CHANGED_MODEL: dict[str, Any] = {
     "density_weight": 0.0,
     "field_weight": 0.0,
     "error_power": 1.0,
+    "members": 2,
     "position_noise": 1e-3,
     "mirror": (0,),
     "jitter": 0.15,
