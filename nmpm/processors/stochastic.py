@@ -66,14 +66,13 @@ class StochasticNetwork(GridProcessor):
     def __init__(self, recipe: Stochastic, network: GridProcessor, channels: int) -> None:
         super().__init__()
         self.network, self.alignment = network, network.alignment
-        self.noise, self.coarse, self.block = recipe.fine + recipe.coarse, recipe.coarse, recipe.block
+        self.channels, self.noise = channels, recipe.fine + recipe.coarse
+        self.coarse, self.block = recipe.coarse, recipe.block
         if (layers := network.channel_layers) is not None:
             self.channel_layers = ChannelLayers(f"network.{layers.first}", f"network.{layers.last}", layers.cells)
             weight = network.get_parameter(f"{layers.first}.weight")
             with torch.no_grad():
                 weight[:, channels * layers.cells : (channels + self.noise) * layers.cells] = 0.0
-
-        self.channels = channels
 
     def forward(self, grid: Tensor) -> Tensor:
         if grid.shape[1] == self.channels:

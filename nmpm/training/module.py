@@ -64,7 +64,7 @@ class EmulatorModule(EvaluatedModule):
         position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
         members: M. From 2 on, a processor that reads noise (`nmpm.processors.Stochastic`) predicts each window M times,
             and is trained by a score that teaches it how uncertain it is, see `nmpm.training.scores`; `error_power`
-            does not act.
+            must be below 1.
         mirror: Axes along which half of the training windows are mirrored; those without gravity.
         jitter: Cells, up to half of one, by which the grid is moved at most in each training step, within the scene's
             wall layer: where cells lie is chance, on which little should depend.
