@@ -155,6 +155,14 @@ def member_starts(
     return moved.with_motion(torch.where(free, moved.position, starts.position), starts.velocity)
 
 
+def mean_pair_distance(members: Tensor) -> Tensor:
+    """Mean of |a - b| over the pairs of at least two members, (*S) of (M, *S) numbers."""
+    count = len(members)
+    rank = torch.arange(1 - count, count, 2, dtype=members.dtype, device=members.device)  # Σ_{i<j} |x_i - x_j|
+    distance: Tensor = torch.tensordot(rank, members.sort(dim=0).values, dims=1) / (count * (count - 1) / 2)
+    return distance
+
+
 def nudge_of(emulator: Emulator, nudge: float | None) -> float:
     """The nudge in cells that is stated, or the default: 0 where the processor reads noise."""
     default = 0.0 if emulator.processor.noise else NUDGE

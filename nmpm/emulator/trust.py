@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nmpm._support.numbers import check_whole, is_finite
-from nmpm.emulator.members import stream_members
+from nmpm.emulator.members import mean_pair_distance, stream_members
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor
 from nmpm.emulator.prescribed import Prescribed
@@ -160,9 +160,7 @@ class TrustTracker:
         rows = members.nan_to_num().flatten(0, 1)
         fields = Linear().p2g(values.flatten(0, 1), self._grid.to_cells(rows), self._grid)
         fields = fields.view(count, batch, -1, *self._grid.shape)
-        rank = torch.arange(1 - count, count, 2, dtype=fields.dtype, device=fields.device)  # Σ_{i<j} |x_i - x_j|
-        apart = torch.tensordot(rank, fields.sort(dim=0).values, dims=1) / (count * (count - 1) / 2)
-        return apart.sum(1), 2 * fields.mean(0).sum(1)
+        return mean_pair_distance(fields).sum(1), 2 * fields.mean(0).sum(1)
 
     def _by_region(self, apart: Tensor, total: Tensor) -> Tensor:
         """(B, *R) disagreement in each region; 0 where it holds less than a cell full of material."""

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nmpm.emulator.members import mean_pair_distance
 from nmpm.grid import counting_grid
 from nmpm.metrics.quantities import energies, front, into_domain, mean_height, volume_fractions
 from nmpm.particles import Window
@@ -46,9 +47,7 @@ def fair_crps(members: Tensor, truth: Tensor) -> Tensor:
     distance: Tensor = (members - truth).abs().mean(0)
     if count == 1:
         return distance
-    rank = torch.arange(1 - count, count, 2, dtype=members.dtype, device=members.device)  # Σ_{i<j} |x_i - x_j|
-    pairs = torch.tensordot(rank, members.sort(dim=0).values, dims=1)
-    score: Tensor = distance - pairs / (count * (count - 1))
+    score: Tensor = distance - mean_pair_distance(members) / 2
     return score
 
 
