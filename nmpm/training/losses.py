@@ -119,8 +119,7 @@ def _tempered_mean(values: Tensor, counts: Tensor, frames: int, power: float) ->
     """`tempered_error` of the means over bundles of (B, T, N) values where `counts` (B, T, N); 0 if none does."""
     number = counts.sum(-1).unflatten(1, (-1, frames)).sum(-1)
     errors = (values * counts).sum(-1).unflatten(1, (-1, frames)).sum(-1) / number.clamp(min=1)
-    tempered = errors if power == 1 else (errors + _FLOOR).pow(power)
-    mean: Tensor = (tempered * number).sum() / number.sum().clamp(min=1)
+    mean: Tensor = (tempered(errors, power) * number).sum() / number.sum().clamp(min=1)
     return mean
 
 
@@ -203,7 +202,12 @@ def check_comparable(predicted: Tensor, target: Tensor, frames: int) -> None:
 def tempered_error(errors: Tensor, mask: Tensor, power: float) -> Tensor:
     """Mean over real particles and bundles of (error + floor) ** power, for errors (B, K) of windows and bundles."""
     count = mask.sum(1, keepdim=True)
-    return ((errors + _FLOOR).pow(power) * count).sum() / (count.sum() * errors.shape[1])
+    return (tempered(errors, power) * count).sum() / (count.sum() * errors.shape[1])
+
+
+def tempered(errors: Tensor, power: float) -> Tensor:
+    """(error + floor) ** power of squared errors; the errors themselves for a power of 1."""
+    return errors if power == 1 else (errors + _FLOOR).pow(power)
 
 
 def density_error(

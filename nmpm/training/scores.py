@@ -2,8 +2,8 @@
 
 A score is the members' mean distance to the truth, less half of the mean distance between two of them. In the mean it
 is least for members drawn from the distribution of the truth: neither too sure, nor too vague. It is fair: its mean
-does not depend on the number of members. Distances of positions are those of the training error of one prediction,
-those of densities are of single cells, each of which must be as uncertain as it is.
+does not depend on the number of members. Distances are of single particles and of single cells, each of which must be
+as uncertain as it is.
 
 Sources: Gneiting & Raftery, Strictly proper scoring rules, prediction, and estimation, JASA 2007 (energy score); Ferro,
 Fair scores for ensemble forecasts, QJRMS 2014.
@@ -23,7 +23,16 @@ from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
-from nmpm.training.losses import TrainingError, field_error, field_targets, last_frames, volume_fractions
+from nmpm.training.losses import (
+    TrainingError,
+    check_comparable,
+    counted,
+    field_error,
+    field_targets,
+    last_frames,
+    tempered,
+    volume_fractions,
+)
 
 T = TypeVar("T")
 B = TypeVar("B", Particles, Window)
@@ -31,7 +40,8 @@ B = TypeVar("B", Particles, Window)
 
 @dataclass(frozen=True)
 class EnsembleError:
-    """The fair energy score of positions, with the fair CRPS of the densities at the last frame of each bundle.
+    """The fair energy score of each particle's position in each frame, with the fair CRPS of the density of each cell
+    at the last frame of each bundle.
 
     Args:
         members: M, at least 2, of each window. They follow each other in a batch.
@@ -54,8 +64,15 @@ class EnsembleError:
             ValueError: if the window has fewer frames than were predicted, or other particles.
         """
         target, members = window.target[:, : predicted.shape[1]], self._split(predicted)
-        of_pair = self.error.of_positions
-        error = fair_score(members, target, lambda one, other: of_pair(one, other, window, grid, frames))
+        check_comparable(members[0], target, frames)
+        counts = counted(window, target.shape[1], frames).view(len(target), -1, target.shape[2])
+        counts = counts.expand(target.shape[:3])
+
+        def distance(one: Tensor, other: Tensor) -> Tensor:
+            squared = grid.to_cell_displacement(one - other, one.dtype).square().mean(-1)
+            return (tempered(squared, self.error.power) * counts).sum() / counts.sum().clamp(min=1)
+
+        error = fair_score(members, target, distance)
         if not self.error.density_weight:
             return error
         last, there = last_frames(window, predicted.shape[1], frames)
