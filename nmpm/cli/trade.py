@@ -25,7 +25,7 @@ from nmpm.cli.options import (
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from nmpm.emulator import Emulator
+    from nmpm.zoo import Pretrained
 
 DESCRIPTION = """Measure the trade between speed and accuracy: time and errors of emulators, of the simulator with fewer
 substeps and on coarser grids, and of trivial predictors, on the same test scenes and machine. Answers what to run for
@@ -130,7 +130,9 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
         scenes = trade.find_scenes(dataset, sweep.scenes, facts)
     _check_materials(match, models)
     device = find_device(options.device)
-    choices = trade.make_choices(sweep, scenes, models, device, predictors, **match._asdict())
+    emulators = {name: model.emulator for name, model in models.items()}
+    nudges = {name: model.nudge for name, model in models.items()}
+    choices = trade.make_choices(sweep, scenes, emulators, device, predictors, nudges, **match._asdict())
     if not choices:
         raise ConfigError("There is nothing to measure: give --models, or settings of the simulator.")
     for line in sweep.models.left_out(device) if models else []:
@@ -145,24 +147,24 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
     sys.stderr.write(f"wrote {', '.join(map(str, paths))}\n")
 
 
-def _check_materials(match: MatchOptions, models: Mapping[str, Emulator]) -> None:
+def _check_materials(match: MatchOptions, models: Mapping[str, Pretrained]) -> None:
     """Raise ConfigError if no model has the materials that an option names; those that have are matched by them."""
     named = set((match.materials or {}).values())
-    if models and not any(named <= set(emulator.scene.materials) for emulator in models.values()):
-        known = sorted({name for emulator in models.values() for name in emulator.scene.materials})
+    if models and not any(named <= set(model.scene.materials) for model in models.values()):
+        known = sorted({name for model in models.values() for name in model.scene.materials})
         raise ConfigError(f"--materials: no model has {', '.join(sorted(named))}; they have {', '.join(known)}.")
 
 
-def _load_models(names: list[str]) -> dict[str, Emulator]:
-    """Emulators by name; those of runs and entries by the folder's name where that is unique."""
+def _load_models(names: list[str]) -> dict[str, Pretrained]:
+    """Models by name; those of runs and entries by the folder's name where that is unique."""
     from nmpm.zoo import load_model
 
     short = {name: Path(name).name if Path(name).is_dir() else name for name in names}
     unique = len(set(short.values())) == len(short)
-    return {short[name] if unique else name: load_model(name).emulator for name in names}
+    return {short[name] if unique else name: load_model(name) for name in names}
 
 
-def _models_of(dataset: str) -> dict[str, Emulator]:
+def _models_of(dataset: str) -> dict[str, Pretrained]:
     """The zoo's models of a simulated dataset by name; damaged ones are left out, and named on stderr."""
     from nmpm.errors import ZooError
     from nmpm.zoo import Zoo, load_model
@@ -172,7 +174,7 @@ def _models_of(dataset: str) -> dict[str, Emulator]:
     for name in Zoo.list():
         try:
             if preset_of(Zoo.card(name)) == dataset:
-                models[name] = load_model(name).emulator
+                models[name] = load_model(name)
         except ZooError as error:
             sys.stderr.write(f"left out: {error}\n")
     return models

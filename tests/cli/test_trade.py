@@ -3,7 +3,7 @@ import json
 from nmpm.cli import main
 from nmpm.cli.trade import _models_of
 from nmpm.evaluation.trade import shipped_sweep_text
-from nmpm.zoo import load_model
+from nmpm.zoo import Pretrained, load_model
 from tests.evaluation.trade.made_up import SWEEP, tiny_emulator, tiny_scenes
 
 
@@ -45,7 +45,7 @@ def test_a_folder_is_measured_with_a_predictor_of_another_package_and_the_report
 
 def test_models_are_compared(tmp_path, capsys, monkeypatch):
     scenes = tiny_scenes(tmp_path / "tiny")
-    model = type("Loaded", (), {"emulator": tiny_emulator(scenes.scene)})
+    model = Pretrained(tiny_emulator(scenes.scene), {})
     monkeypatch.setattr("nmpm.zoo.load_model", lambda _: model)
     words = ["compare", "carried", "--data", str(tmp_path / "tiny"), "--out", str(tmp_path / "out")]
     monkeypatch.setattr("nmpm.evaluation.trade.shipped_sweep_text", lambda _: SWEEP)
@@ -59,7 +59,7 @@ def test_models_are_compared(tmp_path, capsys, monkeypatch):
 
 def test_ensembles_stand_beside_one_rollout_in_time_and_crps(tmp_path, capsys, monkeypatch):
     scenes = tiny_scenes(tmp_path / "tiny")
-    model = type("Loaded", (), {"emulator": tiny_emulator(scenes.scene)})
+    model = Pretrained(tiny_emulator(scenes.scene), {"ensemble": {"nudge": 0.3}})
     monkeypatch.setattr("nmpm.zoo.load_model", lambda _: model)
     (tmp_path / "sweep.yaml").write_text(SWEEP)
     words = ["trade", str(tmp_path / "tiny"), "--models", "carried", "--config", str(tmp_path / "sweep.yaml")]
@@ -67,6 +67,7 @@ def test_ensembles_stand_beside_one_rollout_in_time_and_crps(tmp_path, capsys, m
     assert "CRPS ×10⁻³: fair" in " ".join(capsys.readouterr().out.split())
     choices = {one["name"]: one for one in json.loads((tmp_path / "out" / "trade.json").read_text())["predictors"]}
     ensemble, single = choices["carried, 3 members"], choices["carried"]
+    assert ensemble["settings"]["nudge"] == 0.3  # the card's
     assert 0 < ensemble["errors"]["crps"]["mean"] != single["errors"]["crps"]["mean"] > 0
     assert ensemble["ms_per_frame"]["median"] > single["ms_per_frame"]["median"]
     assert main([*words, "--members", "0"]) == 1

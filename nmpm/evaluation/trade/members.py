@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from nmpm.emulator import Prescribed
-from nmpm.emulator.members import nudge_of, predict_members
+from nmpm.emulator.members import predict_members
 from nmpm.evaluation.trade.choices import ModelChoice, Rollout
 from nmpm.evaluation.trade.scenes import Scenes
 
@@ -20,13 +20,15 @@ class MembersChoice(ModelChoice):
 
     Args:
         members: M. Errors of positions are those of the first, `crps` is that of all.
+        nudge: Cells by which starts are displaced, see `nmpm.emulator.members.member_starts`.
     """
 
     members: int
+    nudge: float
 
     @property
     def identity(self) -> Mapping[str, Any]:
-        return {**super().identity, "members": self.members, "nudge": nudge_of(self.emulator, None)}
+        return {**super().identity, "members": self.members, "nudge": self.nudge}
 
     def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
         (index,) = indices
@@ -35,6 +37,7 @@ class MembersChoice(ModelChoice):
         given = prescribed and prescribed.to(self.device)
 
         def predict(frames: int) -> Tensor:
-            return predict_members(self.emulator, state, frames, self.members, index, prescribed=given).position[:, 0]
+            members = predict_members(self.emulator, state, frames, self.members, index, self.nudge, given)
+            return members.position[:, 0]
 
         return predict

@@ -17,6 +17,7 @@ from nmpm._support.bounded_files import parse_yaml
 from nmpm._support.messages import counted
 from nmpm._support.plain_data import from_plain
 from nmpm.emulator import NETWORK_PRECISIONS, Emulator
+from nmpm.emulator.members import nudge_of
 from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import free_fall, still
 from nmpm.evaluation.matched import MatchedPredictor
@@ -137,6 +138,7 @@ def make_choices(
     models: Mapping[str, Emulator],
     device: torch.device = CPU,
     predictors: Sequence[Callable[[Scene], Predictor]] = (),
+    nudges: Mapping[str, float] | None = None,
     **match: Any,
 ) -> list[Choice]:
     """All choices of a sweep.
@@ -147,6 +149,7 @@ def make_choices(
         models: Trained emulators on the CPU, by name; those of other scenes are rebuilt for these.
         device: Where they compute.
         predictors: Make those of other packages.
+        nudges: Cells by which the starts of a model's members are displaced, by name; the usual ones for others.
         match: How models take scenes of another kind: `materials`, `stride` and `strict` of `fit_to_scenes`.
 
     Raises:
@@ -156,7 +159,9 @@ def make_choices(
     if scenes.preset is not None:
         choices += _simulator_choices(sweep.simulator, scenes.preset)
     for name, emulator in models.items():
-        choices += _model_choices(sweep.models, fit_to_scenes(name, emulator, scenes, **match), scenes, device)
+        model = fit_to_scenes(name, emulator, scenes, **match)
+        choices += _model_choices(sweep.models, model, scenes, device)
+        choices += _ensembles(sweep.models, model, device, (nudges or {}).get(name))
     some_enter = any(recording.present is not None for recording in scenes.recordings)
     bundles = [emulator.frames for emulator in models.values()] if some_enter else []
     predict_by = partial(PredictorChoice, enter_every=max(bundles, default=1))
@@ -223,8 +228,7 @@ def _model_choices(settings: ModelSettings, model: FittedModel, scenes: Scenes, 
     Raises:
         ConfigError: if there is no such runtime.
     """
-    facts = {"model": model.name + OTHER_SCENES * bool(model.differing), "weights": model.weights}
-    facts |= {"scenes_differ_in": model.differing} if model.differing else {}
+    facts = _facts(model)
     forms: dict[str, Choice] = {}
     precisions, runtimes = settings.precisions(device), settings.runtimes(device)
     first = precisions[0], settings.constraints[0], runtimes[0]
@@ -251,11 +255,17 @@ def _model_choices(settings: ModelSettings, model: FittedModel, scenes: Scenes, 
                 device=device,
             )
             forms.setdefault(digest([dict(choice.identity), batch]), choice)
-    return [*forms.values(), *_ensembles(settings, model, device, facts)]
+    return list(forms.values())
+
+
+def _facts(model: FittedModel) -> dict[str, str]:
+    """The settings that all forms of a model have."""
+    facts = {"model": model.name + OTHER_SCENES * bool(model.differing), "weights": model.weights}
+    return facts | ({"scenes_differ_in": model.differing} if model.differing else {})
 
 
 def _ensembles(
-    settings: ModelSettings, model: FittedModel, device: torch.device, facts: Mapping[str, Any]
+    settings: ModelSettings, model: FittedModel, device: torch.device, nudge: float | None
 ) -> Iterator[Choice]:
     """The members of a model's first form; ConfigError for a model that is matched to the scenes."""
     if not settings.members:
@@ -267,10 +277,12 @@ def _ensembles(
         )
     form = model.emulator.with_network(NETWORK_PRECISIONS[settings.precisions(device)[0]])
     form = form if settings.constraints[0] == "held" else form.unconstrained()
+    facts, size = _facts(model), nudge_of(form, nudge)
     yield MembersChoice(
         name=f"{facts['model']}, {counted(settings.members, 'member')}",
         emulator=form.to(device).with_runtime(settings.runtimes(device)[0]),
         members=settings.members,
-        settings=facts,
+        nudge=size,
+        settings=facts | {"nudge": size},
         device=device,
     )
