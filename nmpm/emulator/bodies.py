@@ -47,7 +47,7 @@ def sample_bodies(scenes: Sequence[Sequence[Body]], scene: Scene, grid: Grid) ->
                 f"{type(body).__name__} is a body in {body.dim} dimensions, and this model's scenes have {grid.dim}:"
                 " Ramp, Disc and Polygon are for two, Box and Sphere for three."
             )
-    points = lattice(grid, SAMPLES)
+    points = lattice(grid, SAMPLES)[_near([body for bodies in scenes for body in bodies], grid)]
     solid = torch.stack([_union(bodies, points, grid) for bodies in scenes])
     near = (solid.detach() > 0).any(0)
     volume = grid.cell_volume / SAMPLES**grid.dim
@@ -64,6 +64,20 @@ def lattice(grid: Grid, samples: int) -> Tensor:
     """(K, D) points over the whole domain, so many per cell and axis, in domain length; float64, on the CPU."""
     axes = [(torch.arange(samples * n, dtype=torch.float64, device="cpu") + 0.5) / samples for n in grid.shape]
     return grid.to_length(torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, grid.dim))
+
+
+def _near(bodies: Sequence[Body], grid: Grid) -> Tensor:
+    """(K,) bool: the points of the lattice in cells that bodies may reach into, judged by the cells' centres."""
+    centres, spacing = lattice(grid, 1), torch.tensor(grid.spacing, dtype=torch.float64)
+    reach = (BAND * spacing.amin() + spacing.norm()) / 2
+    near = torch.zeros(len(centres), dtype=torch.bool)
+    with torch.no_grad():
+        for body in bodies:
+            near |= body.distance(centres) <= reach
+    near = near.reshape(grid.shape)
+    for axis in range(grid.dim):
+        near = near.repeat_interleave(SAMPLES, axis)
+    return near.reshape(-1)
 
 
 def _union(bodies: Sequence[Body], points: Tensor, grid: Grid) -> Tensor:

@@ -43,20 +43,20 @@ def push(body: Body, position: Tensor, velocity: Tensor, margin: float, fastest:
         margin: Distance from the body's surface to which they are moved.
         fastest: (D,) largest speed away from the body, in length per frame.
     """
-    depth, outward = _depth_and_normal(body, position)
+    touched = (body.distance(position.double()) < margin).nonzero()[:, 0]
+    depth, outward = _depth_and_normal(body, position[touched])
     out = (margin - depth).clamp(min=0).unsqueeze(-1) * outward
-    touched = (depth < margin).unsqueeze(-1)
-    along = (velocity * outward).sum(-1, keepdim=True)
+    before, limit = velocity[touched], fastest.to(velocity)
+    along = (before * outward).sum(-1, keepdim=True)
     speed = torch.maximum(out.norm(dim=-1, keepdim=True), along)
-    pushed = velocity + (speed - along) * outward
-    limit = fastest.to(velocity)
-    return position + out, torch.where(touched, pushed.clamp(-limit, limit), velocity)
+    pushed = (before + (speed - along) * outward).clamp(-limit, limit)
+    return position.index_add(0, touched, out), velocity.index_copy(0, touched, pushed)
 
 
 def _depth_and_normal(body: Body, position: Tensor) -> tuple[Tensor, Tensor]:
     """(N,) signed distances from a body's surface, and (N, D) directions away from it."""
     with torch.enable_grad():
-        points = position.detach().double().requires_grad_()
+        points = position.double().requires_grad_()
         distance = body.distance(points)
         (normal,) = torch.autograd.grad(distance.sum(), points)
     return distance.detach().to(position), torch.nn.functional.normalize(normal, dim=-1).to(position)

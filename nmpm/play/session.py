@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -56,7 +57,7 @@ class Session:
         self.model, self.scene, self.out = model, model.scene, out
         self.limits = Limits(model)
         self.playing, self.pace = True, 1
-        self._preset = simulator_of(model)
+        self._preset, self._thread = simulator_of(model), ThreadPoolExecutor(1)
         self._beside: SimulatorBeside | None = None
         self._outbox: list[Message] = []
         self._ticks = self._picture = self._seen = 0
@@ -112,8 +113,9 @@ class Session:
         return self._sent()
 
     def close(self) -> None:
-        """End the simulator beside, if there is one."""
+        """End the thread that predicts, and the simulator beside, if there is one."""
         self.set_beside(False)
+        self._thread.shutdown()
 
     # What a player can do; see `nmpm.play.commands`.
 
@@ -168,7 +170,7 @@ class Session:
 
     def restart(self, seed: int) -> None:
         self.limits.check_seed(seed)
-        self.world = World(self.model.emulator, start_of(self.model, seed))
+        self.world = World(self.model.emulator, start_of(self.model, seed), self._thread)
         self.seed, self.frame, self.recording = seed, 0, Recording()
         self._jet = Jet(self.scene.particle_spacing, self.scene.dt)
         self._show_all()

@@ -1,7 +1,8 @@
 """The scene that is played: particles, bodies and gravity at the frame that is shown, and how they go on.
 
-A bundle of frames is predicted at once and shown frame by frame. Whatever changes the scene drops the rest of the
-bundle: the next one starts from the frame that is shown, so that a change is seen in the next picture.
+A bundle of frames is predicted at once and shown frame by frame; while its second half is shown, a thread predicts the
+next one. Whatever changes the scene drops the rest of the bundle and the next one: a new one starts from the frame that
+is shown, so that a change is seen in the next picture.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import dataclasses
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor, Future
 from typing import Any
 
 import torch
@@ -37,6 +39,7 @@ class World:
     Args:
         emulator: What predicts it.
         start: Its first frame.
+        thread: One thread, in which it predicts.
 
     Attributes:
         bodies: Obstacles that may be moved, by id.
@@ -44,8 +47,8 @@ class World:
         static: (1, M, D) obstacles that stay, in domain length.
     """
 
-    def __init__(self, emulator: Emulator, start: Start) -> None:
-        self.emulator, self.static = emulator, start.particles.obstacle
+    def __init__(self, emulator: Emulator, start: Start, thread: Executor) -> None:
+        self.emulator, self.static, self._thread = emulator, start.particles.obstacle, thread
         self.bodies: dict[int, Body] = dict(enumerate(start.bodies))
         self.count = start.particles.position.shape[1]
         self._times: deque[float] = deque(maxlen=_TIMED_CALLS)
@@ -77,8 +80,10 @@ class World:
     def advance(self) -> None:
         """Go on by a frame."""
         if self._index + 1 == len(self._path):
-            self._predict()
+            self._begin_next()
         self._index += 1
+        if 2 * self._index >= len(self._path):
+            self._coming()
 
     def now(self) -> Particles:
         """The state at the frame that is shown, padded."""
@@ -150,14 +155,25 @@ class World:
         self._state, self._path, self._index = state, state.position, 0
         self._fields: Mapping[str, Tensor] = {}
         self._bundles: Iterator[Bundle] = unroll(self.emulator, state, _ENDLESS)
+        self._next: Future[Bundle] | None = None
 
-    def _predict(self) -> None:
+    def _begin_next(self) -> None:
+        bundle = self._coming().result()
+        self._path, self._index = torch.cat([self._path[-1:], bundle.position[0]]), 0
+        self._fields, self._next = bundle.fields, None
+
+    def _coming(self) -> Future[Bundle]:
+        """The next bundle, which the thread predicts from now on; one that was dropped is awaited first."""
+        if self._next is None:
+            self._next = self._thread.submit(self._predict, self._bundles)
+        return self._next
+
+    def _predict(self, bundles: Iterator[Bundle]) -> Bundle:
         started = time.perf_counter()
         with torch.no_grad():
-            bundle = next(self._bundles)
+            bundle = next(bundles)
         self._times.append(time.perf_counter() - started)
-        self._path, self._index = torch.cat([self._path[-1:], bundle.position[0]]), 0
-        self._fields = bundle.fields
+        return bundle
 
 
 def _padded(state: Particles, count: int) -> Particles:

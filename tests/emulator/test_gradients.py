@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nmpm.emulator import Emulator, differentiable_rollout
-from nmpm.emulator.bodies import sample_bodies, solid_share
+from nmpm.emulator.bodies import BAND, SAMPLES, lattice, sample_bodies, solid_share
 from nmpm.emulator.rasterise import grid_state
 from nmpm.errors import ConfigError, DataError
 from nmpm.grid import Grid
@@ -138,6 +138,17 @@ def test_bodies_that_no_cell_would_see_are_refused(dim, body, message):
     scene = box(dim, obstacles=True)
     with pytest.raises(ConfigError, match=message):
         sample_bodies([[body]], scene, Grid.of(scene, 8))
+
+
+@pytest.mark.parametrize(
+    "body", [Ramp((0.5, 0.4), 0.3, 0.06, 0.4), Disc((0.02, 0.9), 0.2), Sphere((0.5, 0.4, 0.6), 0.2)]
+)
+def test_no_point_of_a_body_is_left_out(body):
+    scene = box(body.dim, obstacles=True)
+    grid = Grid.of(scene, 8)
+    points = lattice(grid, SAMPLES)
+    solid = solid_share(body.distance(points), BAND * min(grid.spacing)) > 0
+    assert torch.equal(sample_bodies([[body]], scene, grid)[0], points[solid])
 
 
 # ---- states

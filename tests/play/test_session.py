@@ -145,6 +145,22 @@ def test_a_restart_gives_the_same_again(play):
     assert "must be" in player.do("restart", seed=-1)
 
 
+def test_what_is_predicted_ahead_is_what_a_rollout_predicts_and_dropped_when_the_scene_changes(play):
+    player = play()
+    model = player.session.model
+    state = player.session.world.now()
+    player.tick(20)
+    rolled = model.rollout(state, 20)[0, -1]
+    assert torch.equal(player.session.world.position, rolled[: player.session.world.count])
+    player.tick(2)  # the next bundle is being predicted
+    count, now = player.session.world.count, player.session.world.position.clone()
+    before = player.session.world._path[player.session.world._index - 1, :count]
+    throw(player)
+    after = player.session.world.position[:count]
+    assert len(player.position) == count + 36
+    assert (after - now).norm(dim=-1).max() < 2 * (now - before).norm(dim=-1).max() + 0.01
+
+
 def test_what_was_played_is_a_trajectory_that_the_viewer_opens(play):
     player = play()
     assert "nothing was played yet" in play().do("save")
