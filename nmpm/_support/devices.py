@@ -1,18 +1,27 @@
-"""Devices by name."""
+"""Devices by name; torch is imported where a device is looked for."""
 
 from __future__ import annotations
 
 import platform
+import re
 from pathlib import Path
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING
 
 from nmpm._support.messages import counted, one_line
 from nmpm.errors import ConfigError
 
+if TYPE_CHECKING:
+    import torch
+    from torch import Tensor
+
 DEVICES = ("auto", "cpu", "cuda", "mps")
 """Names that `--device` takes; "cuda:1" means the second GPU."""
+
+
+def check_device_name(name: str) -> None:
+    """Raise ConfigError for a text that names no device, on whatever machine."""
+    if re.fullmatch(rf"({'|'.join(DEVICES)})(:[0-9]+)?", name) is None:
+        raise ConfigError(f"--device {one_line(name, 60)}: it is not one of {', '.join(DEVICES)}.")
 
 
 def find_device(name: torch.device | str = "auto") -> torch.device:
@@ -21,6 +30,8 @@ def find_device(name: torch.device | str = "auto") -> torch.device:
     Raises:
         ConfigError: if this machine does not have the device.
     """
+    import torch
+
     counts = {
         "cuda": torch.cuda.device_count() if torch.cuda.is_available() else 0,
         "mps": int(torch.backends.mps.is_available()),
@@ -43,6 +54,8 @@ def find_device(name: torch.device | str = "auto") -> torch.device:
 
 def device_name(device: torch.device, threads: int | None = None) -> str:
     """The model of a device: of the GPU, or of the processor with the number of threads, by default those of torch."""
+    import torch
+
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
     if device.type == "cpu":
@@ -56,6 +69,8 @@ def computes_bfloat16(device: torch.device) -> bool:
     An x86 CPU has with AVX512_BF16. With other AVX-512, oneDNN emulates them, and a training step takes 1.7 times as
     long as in float32; without, torch's own loops take 8 to 10 times as long.
     """
+    import torch
+
     if device.type != "cpu":
         return True
     if not torch.backends.mkldnn.is_available() or not torch.ops.mkldnn._is_mkldnn_bf16_supported():

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from nmpm._support.messages import suggestion
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, DataError
 
 PACKAGE = Path(__file__).parents[1]
 """The folder of the package."""
@@ -32,6 +32,35 @@ def entry_names(zoo: Path) -> list[str]:
     """Names of the models in the folder of a zoo, such as "goop" or "goop/fast"."""
     cards = (*zoo.glob("*/card.yaml"), *zoo.glob("*/*/card.yaml"))
     return sorted(card.parent.relative_to(zoo).as_posix() for card in cards)
+
+
+def preset_names() -> tuple[str, ...]:
+    """Names of the shipped presets of simulators, which are those of the embedded datasets."""
+    return tuple(sorted(path.stem for path in (PACKAGE / "sim" / "presets").glob("*.yaml")))
+
+
+def check_dataset(name: str) -> None:
+    """Raise DataError if no embedded dataset has the name."""
+    if name not in preset_names():
+        raise DataError(
+            f"No embedded dataset is called {name!r}; known: {', '.join(preset_names())}. For your own data, give"
+            " the path of their folder."
+        )
+
+
+def find_preset(name: str | Path) -> Path:
+    """The file of a preset: the shipped one of that name, else a file that exists.
+
+    Raises:
+        ConfigError: if there is neither.
+    """
+    names = preset_names()
+    path = PACKAGE / "sim" / "presets" / f"{name}.yaml" if str(name) in names else Path(name)
+    if not path.is_file():
+        raise ConfigError(
+            f"There is no preset or file {name}; shipped presets: {', '.join(names)}.{suggestion(str(name), names)}"
+        )
+    return path
 
 
 def config_names() -> list[str]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
-from nmpm.cli.options import MODEL, HelpFormatter
+from nmpm.cli.options import MODEL, HelpFormatter, check_data
 from nmpm.cli.trade import add_scene_options, measure_and_report
 
 DESCRIPTION = """Compare models on test scenes that they need not have been trained on: other particle counts, other
@@ -41,4 +42,5 @@ def run(words: list[str]) -> None:
     add_scene_options(parser, "compare", scenes=6)
     parser.set_defaults(config=None, predictors=[], members=None)
     options = parser.parse_args(words[1:])
+    check_data("--data", Path(options.data))
     measure_and_report("compare", options, options.data)

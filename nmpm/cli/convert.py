@@ -14,7 +14,7 @@ from nmpm.cli.options import (
     check_at_least,
     check_folder,
     data_options,
-    new_ids,
+    parse_option,
 )
 from nmpm.errors import ConfigError
 
@@ -50,7 +50,8 @@ def run(words: list[str]) -> None:
     """Run the command, e.g. ["convert", "datasets/WaterRamps", "water"]."""
     arguments = _parser().parse_args(words[1:])
     check_at_least("--trajectory", arguments.trajectory, 0)
-    options, ids = data_options(arguments), new_ids(arguments.ids)
+    options = data_options(arguments)
+    ids = parse_option("--ids", arguments.ids, _new_ids, "OLD=NEW pairs of type ids, e.g. 5=0,3=1")
     if _is_file_name(arguments.destination):
         _export(arguments, options, ids)
         return
@@ -120,3 +121,8 @@ def _export(arguments: argparse.Namespace, options: Options, ids: dict[int, int]
         sys.stdout.write(f"wrote {exported.path}; to look at it: {writer.hint(exported.path)}\n")
     else:
         sys.stdout.write(f"wrote {exported.files} trajectories to {exported.path}, a file each\n")
+
+
+def _new_ids(text: str) -> dict[int, int]:
+    pairs = [pair.split("=") for pair in text.split(",")]
+    return {int(old): int(new) for old, new in pairs}

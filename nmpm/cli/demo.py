@@ -10,7 +10,15 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.options import MODEL, HelpFormatter, add_device_option, check_at_least, check_device, check_output
+from nmpm.cli.options import (
+    MODEL,
+    HelpFormatter,
+    add_device_option,
+    check_at_least,
+    check_device,
+    check_model,
+    check_output,
+)
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -42,6 +50,7 @@ def run(words: list[str]) -> None:
     file, page = (stem.with_name(f"{stem.name}{suffix}") for suffix in (".h5", ".html"))
     for path in (file, page):
         check_output("--out", path)
+    check_model(options.model)
     check_device(options.device)
     from nmpm.cli.options import choose_threads
     from nmpm.cli.prediction import predicted, timed_rollout

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from nmpm._support.bounded_files import read_yaml
-from nmpm._support.shipped import PACKAGE, find_config
+from nmpm._support.shipped import PACKAGE, check_dataset, find_config
+from nmpm.cli.options import check_model
 from nmpm.errors import ConfigError, DataError
 
 NOT_FILES = (None, "last", "best", "null", "???")
@@ -76,7 +77,7 @@ def check_options(options: Sequence[Option]) -> None:
 
     Raises:
         UsageError: for a misspelt name, or a configuration that is not YAML.
-        ConfigError, DataError: if dataset or checkpoint do not exist.
+        ConfigError, DataError, ZooError: if dataset, checkpoint or the model to start from do not exist.
     """
     configs = [read_config(Path(value)) for name, value in options if name == "--config" and value]
     for group in SIGNATURES:
@@ -86,6 +87,9 @@ def check_options(options: Sequence[Option]) -> None:
     path = _value(options, configs, "data.path")
     _check_exists("--data.path", path, "dataset")
     _check_exists("--ckpt_path", _value(options, configs, "ckpt_path"), "checkpoint")
+    start = _value(options, configs, "start_from")
+    if start not in NOT_FILES and "${" not in str(start):
+        check_model(str(start))
     if path in NOT_FILES and _value(options, configs, "data.source") in (None, "disk", "simulate"):
         _check_dataset(_value(options, configs, "data.name"))
 
@@ -175,8 +179,5 @@ def _check_exists(option: str, value: Any, kind: str) -> None:
 
 
 def _check_dataset(name: Any) -> None:
-    if name in NOT_FILES or "${" in str(name) or (PACKAGE / "sim" / "presets" / f"{name}.yaml").is_file():
-        return
-    from nmpm.data import catalog
-
-    catalog.describe(str(name))
+    if name not in NOT_FILES and "${" not in str(name):
+        check_dataset(str(name))

@@ -8,7 +8,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.options import HelpFormatter, add_device_option, add_model_options, check_device, check_output
+from nmpm.cli.options import (
+    HelpFormatter,
+    add_device_option,
+    add_model_options,
+    check_device,
+    check_model,
+    check_output,
+)
 from nmpm.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -38,6 +45,7 @@ def run(words: list[str]) -> None:
     if out.suffix != f".{options.format}":
         raise ConfigError(f"--out {out}: for --format {options.format} its name must end in .{options.format}.")
     check_output("--out", out)
+    check_model(options.model, options.root)
     check_device(options.device)
     if options.format == "onnx" and options.device != "cpu":
         raise ConfigError(

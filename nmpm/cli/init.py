@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.options import HelpFormatter, add_data_options, check_output, data_options
+from nmpm.cli.options import HelpFormatter, add_data_options, check_exists, check_output, data_options
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -58,6 +58,7 @@ def run(words: list[str]) -> None:
             )
     if not arguments.minutes > 0:
         raise ConfigError(f"--minutes {arguments.minutes:g}: it must be positive.")
+    check_exists("PATH", arguments.path)
     name = dataset_name(arguments.path)
     out = arguments.out or Path(f"{name}.yaml")
     if out.exists():
@@ -89,8 +90,6 @@ def _write(path: Path, options: Options, out: Path, root: str, minutes: float) -
     from nmpm.data.new_configuration import Choice, CompletedSource, render_configuration
     from nmpm.evaluation.pace import measure_machine
 
-    if not path.exists():
-        raise ConfigError(f"{path}: there is no such file or folder.")
     source, facts = CompletedSource.of(FolderSource(path, options)).look()
     scene = source.data.scene
     choice = Choice.of(scene, facts, measure_machine(scene.dim, minutes))

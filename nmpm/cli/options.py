@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from nmpm._support.atomic import file_obstacle, folder_obstacle, name_obstacle
+from nmpm._support.devices import check_device_name, find_device
 from nmpm._support.messages import suggestion
+from nmpm._support.shipped import preset_names
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -105,13 +107,18 @@ def add_split_option(parser: argparse.ArgumentParser, option: str) -> None:
     )
 
 
+def check_model(model: str, root: Path | None = None) -> None:
+    """Raise ZooError, before torch is imported, if there is no such model; downloads nothing."""
+    from nmpm.zoo.registry import locate_model
+
+    locate_model(model, root)
+
+
 def check_device(name: str) -> None:
     """Raise ConfigError if a `--device` cannot run rollouts, as torch's "meta", or this machine does not have it."""
-    from nmpm._support.devices import DEVICES, find_device
-
-    if name.partition(":")[0] not in DEVICES:
-        raise ConfigError(f"--device {name}: it is not one of {', '.join(DEVICES)}.")
-    find_device(name)
+    check_device_name(name)
+    if name not in ("auto", "cpu"):  # which every machine has
+        find_device(name)
 
 
 def check_at_least(option: str, value: int | None, least: int) -> None:
@@ -162,11 +169,10 @@ def check_exists(option: str, path: Path) -> None:
 
 def check_data(option: str, data: Path) -> None:
     """Raise ConfigError if data are neither a file or folder nor an embedded dataset."""
-    from nmpm.data.catalog import catalog
-
-    if not data.exists() and str(data) not in catalog():
-        names = f"there is no such file or folder, nor an embedded dataset of that name: {', '.join(catalog())}."
-        raise ConfigError(f"{option} {data}: {name_obstacle(data) or names + suggestion(str(data), catalog())}")
+    names = preset_names()
+    if not data.exists() and str(data) not in names:
+        known = f"there is no such file or folder, nor an embedded dataset of that name: {', '.join(names)}."
+        raise ConfigError(f"{option} {data}: {name_obstacle(data) or known + suggestion(str(data), names)}")
 
 
 def find_data(data: Path, split: str | None, index: int) -> Path:
@@ -248,16 +254,6 @@ def gravity_option(text: str | None) -> tuple[float, ...] | None:
         "--gravity", text, _numbers, "a number for each axis, e.g. 0,-9.81"
     )
     return numbers
-
-
-def new_ids(text: str | None) -> dict[int, int] | None:
-    """The pairs of `--ids`; raises ConfigError if they cannot be read."""
-    pairs: dict[int, int] | None = parse_option("--ids", text, _pairs, "OLD=NEW pairs of type ids, e.g. 5=0,3=1")
-    return pairs
-
-
-def _pairs(text: str) -> dict[int, int]:
-    return {old: int(new) for old, new in _names(text).items()}
 
 
 def parse_option(option: str, text: str | None, parse: Callable[[str], Any], expected: str) -> Any:

@@ -15,6 +15,7 @@ from nmpm.cli.options import (
     add_threads_option,
     check_at_least,
     check_device,
+    check_model,
     choose_threads,
 )
 from nmpm.data.write import find_writer
@@ -99,4 +100,5 @@ def _check(options: argparse.Namespace) -> None:
     if options.out.suffix.lower() != ".h5":
         raise ConfigError(f"--out {options.out}: what was played is written as .h5.")
     find_writer("--out", options.out)
+    check_model(options.model, options.root)
     check_device(options.device)

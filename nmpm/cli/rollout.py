@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm._support.shipped import find_preset
 from nmpm.cli.match_options import MatchOptions, add_match_options
 from nmpm.cli.options import (
     HelpFormatter,
@@ -21,6 +22,7 @@ from nmpm.cli.options import (
     check_at_least,
     check_data,
     check_device,
+    check_model,
     choose_threads,
     data_options,
     find_data,
@@ -238,6 +240,9 @@ def _check(options: argparse.Namespace) -> None:
     elif facts := [fact for fact in stated_facts(options) if not fact.startswith("--gravity")]:
         raise ConfigError(f"{facts[0]} is about recorded data: give --data too.")
     _check_members(options)
+    if options.fallback is not None:
+        find_preset(options.fallback)
+    check_model(options.model, options.root)
     check_device(options.device)
 
 

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm._support.shipped import find_preset
 from nmpm.cli.options import HelpFormatter, check_at_least, check_folder, check_picture
 
 if TYPE_CHECKING:
@@ -64,6 +65,7 @@ def run(words: list[str]) -> None:
         return
     if options.name is None:
         parser.error("name a scene, or use --list")
+    find_preset(options.name)
     if options.show:
         from nmpm.sim.loading import preset_text
 

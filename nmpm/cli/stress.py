@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm._support.shipped import find_preset
 from nmpm.cli.match_options import MatchOptions, add_match_options, describe
 from nmpm.cli.options import (
     HelpFormatter,
@@ -18,6 +19,7 @@ from nmpm.cli.options import (
     check_at_least,
     check_device,
     check_folder,
+    check_model,
     choose_threads,
 )
 from nmpm.errors import ConfigError
@@ -44,8 +46,11 @@ examples:
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["stress", "goop"]."""
     arguments = _parser().parse_args(words[1:])
-    check_device(arguments.device)
     check_at_least("--threads", arguments.threads, 1)
+    if arguments.preset is not None:
+        find_preset(arguments.preset)
+    check_model(arguments.model, arguments.root)
+    check_device(arguments.device)
     stated = MatchOptions.read(arguments.materials, arguments.stride, arguments.strict)
     if stated != MatchOptions() and not arguments.preset:
         raise ConfigError("--materials, --stride and --strict are about the scenes of a --preset: give it too.")

@@ -16,9 +16,11 @@ from nmpm.cli.options import (
     add_device_option,
     add_style_option,
     check_at_least,
+    check_data,
     check_device,
     check_folder,
     check_input,
+    check_model,
     data_options,
     stated_facts,
 )
@@ -61,6 +63,7 @@ def run(words: list[str]) -> None:
         raise ConfigError("name a dataset, such as goop, or the folder of one; see nmpm trade --help.")
     if options.config is not None:
         check_input("--config", options.config)
+    check_data("DATASET", Path(options.dataset))
     measure_and_report("trade", options, options.dataset)
 
 
@@ -104,6 +107,8 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
     check_at_least("--members", options.members, 1)
     if options.wider and (stated := stated_facts(options)):
         raise ConfigError(f"{stated[0]}: --wider simulates scenes, and their facts are known: leave it out.")
+    for name in options.models or ():
+        check_model(name)
     check_device(options.device)
     wider = f"-{options.wider}-times-as-wide" if options.wider else ""
     out = options.out or Path(command) / f"{Path(dataset).name}{wider}"

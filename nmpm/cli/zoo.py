@@ -9,7 +9,7 @@ from pathlib import Path
 
 from nmpm._support.messages import one_line
 from nmpm.cli import zoo_match
-from nmpm.cli.options import HelpFormatter, add_device_option, check_device
+from nmpm.cli.options import HelpFormatter, add_device_option, check_device, check_model
 
 _ROOT = "folder of another zoo (default: your own, NMPM_HOME/zoo or ~/.cache/nmpm/zoo, and the shipped one)"
 _MODEL = "name, an entry's folder, or owner/repository@revision of the hub"
@@ -111,14 +111,15 @@ def _list(options: argparse.Namespace) -> None:
 
 def _card(options: argparse.Namespace) -> None:
     from nmpm._support.bounded_files import to_yaml
-    from nmpm.zoo.entries import read_card
-    from nmpm.zoo.pages import complete_card, entry_page
+    from nmpm.zoo.entry_files import read_card
     from nmpm.zoo.registry import find_entry
 
     card = read_card(find_entry(options.name, options.root))
     if options.yaml:
         sys.stdout.write(to_yaml(card))
         return
+    from nmpm.zoo.pages import complete_card, entry_page  # imports torch
+
     with complete_card(options.name):
         text = entry_page(card)
     text = f"{text.rstrip()}\n\n## What runs here\n\n```text\n{_explain(options.name, options.root)}\n```\n"
@@ -156,10 +157,13 @@ def _verify(options: argparse.Namespace) -> int:
     """
     from nmpm.errors import ConfigError, NmpmError
     from nmpm.zoo.registry import Zoo, find_entry
-    from nmpm.zoo.verification import verify_entry
 
     _check_one("--data is the folder of one model's data", options.data, options.name)
+    if options.name is not None:
+        check_model(options.name, options.root)
     check_device(options.device)
+    from nmpm.zoo.verification import verify_entry  # imports torch
+
     failed, left_out = 0, []
     for name in Zoo.list(options.root) if options.name is None else [options.name]:
         sys.stdout.write(f"{name}\n")
@@ -184,15 +188,16 @@ def _verify(options: argparse.Namespace) -> int:
 
 def _refresh(options: argparse.Namespace) -> None:
     from nmpm._support.shipped import user_zoo
-    from nmpm.zoo.refresh import refresh, write_index
     from nmpm.zoo.registry import Zoo
 
     _check_one("--data is the folder of one model's data", options.data, options.name)
     _check_one("--failures is about one model", options.failures, options.name)
-    check_device(options.device)
     root = user_zoo() if options.root is None else options.root
     names = Zoo.list(root) if options.name is None else [options.name]
     folders = [_find_writable(name, options.root) for name in names]
+    check_device(options.device)
+    from nmpm.zoo.refresh import refresh, write_index  # imports torch
+
     for folder in folders:
         refresh(folder, options.measure, options.data, options.failures, options.device)
         sys.stdout.write(f"wrote {folder}\n")
@@ -241,13 +246,14 @@ def _push(options: argparse.Namespace) -> None:
 
 def _pull(options: argparse.Namespace) -> None:
     from nmpm.errors import ConfigError
-    from nmpm.zoo.entries import load_entry
     from nmpm.zoo.hub import HubId, download, pull
-    from nmpm.zoo.publish import new_entry_folder
 
     identifier = HubId.parse(options.id)
     if identifier is None:
         raise ConfigError(f"{options.id} is not owner/repository@revision; the revision may be a commit, or main.")
+    from nmpm.zoo.entries import load_entry  # imports torch
+    from nmpm.zoo.publish import new_entry_folder
+
     if options.name is None:
         folder = download(identifier)
         load_entry(folder)

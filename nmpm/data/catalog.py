@@ -13,13 +13,12 @@ from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
-from nmpm._support.shipped import user_home
+from nmpm._support.shipped import check_dataset, preset_names, user_home
 from nmpm.data.format import METADATA_FILE, read_metadata
 from nmpm.data.generate import generate
 from nmpm.data.simulation import SimulationRequest, same_trajectories
-from nmpm.errors import DataError
 from nmpm.scene import Scene
-from nmpm.sim import load_preset, preset_names
+from nmpm.sim import load_preset
 
 
 @dataclass(frozen=True)
@@ -51,11 +50,7 @@ def catalog() -> tuple[str, ...]:
 
 def describe(name: str) -> CatalogEntry:
     """The catalog's entry for an embedded dataset; raises a DataError if there is none of that name."""
-    if name not in catalog():
-        raise DataError(
-            f"No embedded dataset is called {name!r}; known: {', '.join(catalog())}. For your own data, give"
-            " the path of their folder."
-        )
+    check_dataset(name)
     return _OTHERS.get(name, _USUAL)
 
 

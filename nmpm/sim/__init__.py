@@ -4,7 +4,8 @@
 SPH, 2-D) implement it, and `presets/` describes the shipped scenes.
 """
 
-from nmpm.sim.loading import load_preset, name_parts, preset_from_dict, preset_names
+from nmpm._support.shipped import preset_names
+from nmpm.sim.loading import load_preset, name_parts, preset_from_dict
 from nmpm.sim.mpm.layouts import SimulatedRamp
 from nmpm.sim.mpm.preset import MpmPreset
 from nmpm.sim.preset import Preset

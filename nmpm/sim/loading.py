@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 from nmpm._support.bounded_files import parse_yaml, read_text
-from nmpm._support.messages import one_line, suggestion
+from nmpm._support.messages import one_line
+from nmpm._support.shipped import find_preset, preset_names
 from nmpm.errors import ConfigError
 from nmpm.sim.mpm.mixture import MpmMixture
 from nmpm.sim.mpm.preset import MpmPreset
@@ -16,12 +16,6 @@ from nmpm.sim.preset import Preset
 from nmpm.sim.sph.preset import SphPreset
 
 SOLVERS: dict[str, type[Preset]] = {kind.solver: kind for kind in (MpmPreset, MpmMixture, SphPreset)}
-
-
-def preset_names() -> tuple[str, ...]:
-    """Names of the shipped presets."""
-    shipped = resources.files("nmpm.sim") / "presets"
-    return tuple(sorted(i.name.removesuffix(".yaml") for i in shipped.iterdir() if i.name.endswith(".yaml")))
 
 
 def load_preset(name_or_path: str | Path) -> Preset:
@@ -45,16 +39,7 @@ def preset_text(name_or_path: str | Path) -> str:
         ConfigError: if there is no such preset.
         DataError: if it cannot be read.
     """
-    path = Path(str(resources.files("nmpm.sim"))) / "presets" / f"{name_or_path}.yaml"
-    if str(name_or_path) not in preset_names():
-        path = Path(name_or_path)
-    if not path.is_file():
-        names = preset_names()
-        raise ConfigError(
-            f"There is no preset or file {name_or_path}; shipped presets: {', '.join(names)}."
-            + suggestion(str(name_or_path), names)
-        )
-    return read_text(path)
+    return read_text(find_preset(name_or_path))
 
 
 def preset_from_dict(plain: Mapping[str, Any]) -> Preset:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import hashlib
-import io
 import json
 import math
 from collections.abc import Iterator, Mapping
@@ -19,26 +17,18 @@ from safetensors.torch import load
 from torch import Tensor, nn
 from torch.nn.modules import module as hooks
 
-from nmpm._support.bounded_files import TEXT_BYTES, read_bounded, read_text, read_yaml
+from nmpm._support.bounded_files import TEXT_BYTES, read_bounded, read_yaml
 from nmpm._support.messages import one_line
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.errors import ConfigError, DataError, NmpmError, ZooError
 from nmpm.processors import GridLayout
-from nmpm.zoo.card import CARD, FORMAT
+from nmpm.zoo.card import CARD
+from nmpm.zoo.entry_files import BEST, CONFIG, WEIGHT_BYTES, WEIGHTS, read_card
 from nmpm.zoo.pretrained import Pretrained
 
 if TYPE_CHECKING:
     from nmpm.training.module import EmulatorModule
 
-CONFIG, WEIGHTS, SCENES = "config.yaml", "model.safetensors", "scenes.csv"
-TABLES_AND_PICTURES = ("README.md", SCENES, "errors.csv", "training.csv", "chart.png", "rollout.png", "worst.png")
-FILES = (CARD, CONFIG, WEIGHTS, *TABLES_AND_PICTURES)
-"""All files of an entry; the tables and pictures may be missing."""
-BEST = Path("checkpoints") / "best.ckpt"
-"""The best checkpoint within a run's folder."""
-LAST = BEST.with_name("last.ckpt")
-"""The last checkpoint, of runs without validation the only one."""
-WEIGHT_BYTES = 2**33
 INTEGER = 2**24
 """Largest integer in a model's recipe; some are exponents."""
 CELLS, FRAMES = 2**24, 2**12
@@ -47,34 +37,6 @@ PARAMETERS, LAYERS = 10**9, 5_000
 """Parameters of a network; its modules, and tensors of parameters."""
 REAL = frozenset({torch.float16, torch.bfloat16, torch.float32, torch.float64})
 """Types of stored weights that are converted to the model's own."""
-Rows = list[dict[str, float]]
-"""Figures by their names, of each test scene."""
-
-
-def read_card(folder: Path) -> dict[str, Any]:
-    """The content of an entry's card; raises ZooError if it is missing, damaged or of another format."""
-    try:
-        card = read_yaml(folder / CARD)
-    except DataError as error:
-        raise ZooError(str(error)) from error
-    if card.get("format") != FORMAT:
-        raise ZooError(
-            f"{folder / CARD} has format {one_line(card.get('format'), 60)}; this nmpm reads {FORMAT}: use a"
-            " version that reads it."
-        )
-    return card
-
-
-def read_scenes(folder: Path) -> Rows:
-    """The errors of each test scene, from `scenes.csv`; raises ZooError if it is missing or damaged."""
-    try:
-        lines = csv.DictReader(io.StringIO(read_text(folder / SCENES)), strict=True)
-        rows = [{name: float(value) for name, value in line.items() if value} for line in lines]
-    except (DataError, csv.Error, TypeError, ValueError, AttributeError) as error:
-        raise ZooError(f"The errors of single test scenes are not known: {one_line(error)}") from error
-    if not rows or not all(rows):
-        raise ZooError(f"{folder / SCENES} states no errors of single test scenes.")
-    return rows
 
 
 def load_entry(folder: Path) -> Pretrained:

@@ -22,7 +22,7 @@ from nmpm._support.bounded_files import read_bounded, read_yaml, to_yaml
 from nmpm._support.messages import one_line
 from nmpm.errors import DataError, ZooError
 from nmpm.zoo.card import CARD, SIMULATED
-from nmpm.zoo.entries import FILES, WEIGHT_BYTES, WEIGHTS, load_entry
+from nmpm.zoo.entry_files import FILES, WEIGHT_BYTES, WEIGHTS
 
 REPOSITORY = r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}"
 REVISION = r"[\w./-]{1,100}"
@@ -110,6 +110,8 @@ def pull(identifier: HubId, target: Path, name: str) -> Path:
     Card and README have the new name, and the card the commit as `source`. Raises ZooError if the model cannot be
     downloaded or loaded.
     """
+    from nmpm.zoo.entries import load_entry  # imports torch
+
     folder = download(identifier)
     card = dict(load_entry(folder).card) | {"name": name, "source": f"{identifier.repository}@{folder.name}"}
     with atomic_folder(target) as new:
@@ -140,6 +142,8 @@ def push(entry: Path, repository: str, private: bool = False) -> HubId:
     """
     if re.fullmatch(REPOSITORY, repository) is None:
         raise ZooError(f"{one_line(repository, 100)} is not owner/repository.")
+    from nmpm.zoo.entries import load_entry  # imports torch
+
     card = load_entry(entry).card
     with tempfile.TemporaryDirectory() as folder:
         for name in FILES:

@@ -26,7 +26,8 @@ from nmpm.evaluation.figures import (
     with_unit,
 )
 from nmpm.zoo.card import FACTOR, fastest_time, lifecycle, stated_milliseconds, trivial_error
-from nmpm.zoo.entries import CONFIG, read_card, read_recipe
+from nmpm.zoo.entries import read_recipe
+from nmpm.zoo.entry_files import CONFIG, read_card
 from nmpm.zoo.speed_table import speed_tables
 
 if TYPE_CHECKING:

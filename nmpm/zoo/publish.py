@@ -26,7 +26,7 @@ from nmpm.emulator.adaptation import adapted
 from nmpm.errors import ZooError
 from nmpm.training.checkpoints import load_module, read_checkpoint
 from nmpm.zoo.card import CARD, FORMAT, intervals, stress_digest
-from nmpm.zoo.entries import BEST, CONFIG, SCENES, WEIGHTS
+from nmpm.zoo.entry_files import BEST, CONFIG, SCENES, WEIGHTS
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.refresh import write_card, write_index, writing
 from nmpm.zoo.registry import check_name

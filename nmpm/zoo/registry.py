@@ -8,6 +8,7 @@ An entry is a folder `<name>` (or `<dataset>/<variant>`) of
     README.md           the card for reading
 
 There are two zoos: the one that ships with the package, and the user's own (see `user_zoo`), which comes first.
+Torch is imported where a model is loaded, so that names are looked up, and refused, at once.
 """
 
 from __future__ import annotations
@@ -16,9 +17,7 @@ import builtins
 import re
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
-
-import torch
+from typing import TYPE_CHECKING, Any
 
 from nmpm._support.devices import device_name, find_device
 from nmpm._support.messages import one_line, suggestion
@@ -26,10 +25,13 @@ from nmpm._support.shipped import entry_names, shipped_folder, user_zoo
 from nmpm.errors import ConfigError, ZooError
 from nmpm.zoo.card import CARD, stated_milliseconds
 from nmpm.zoo.choice import Limits, choose
-from nmpm.zoo.entries import BEST, LAST, load_checkpoint, load_entry, read_card
+from nmpm.zoo.entry_files import BEST, LAST, read_card
 from nmpm.zoo.hub import HubId, download
-from nmpm.zoo.measures.speed import measure_speed
-from nmpm.zoo.pretrained import Pretrained
+
+if TYPE_CHECKING:
+    import torch
+
+    from nmpm.zoo.pretrained import Pretrained
 
 NAME_LENGTH = 100
 """Longest name of an entry."""
@@ -129,6 +131,8 @@ def load_model(model: str | Path, device: torch.device | str = "cpu", root: Root
         DataError: if a checkpoint cannot be read.
         ConfigError: if this machine does not have the device, or a newer nmpm wrote the model.
     """
+    from nmpm.zoo.entries import load_checkpoint, load_entry  # imports torch
+
     target = find_device(device)
     path = find_model(model, root)
     if not path.is_dir():
@@ -143,6 +147,12 @@ def load_model(model: str | Path, device: torch.device | str = "cpu", root: Root
 
 def find_model(model: str | Path, root: Root = None) -> Path:
     """The folder or checkpoint that a name, a path or an id means, as for `load_model`; an id is downloaded."""
+    place = locate_model(model, root)
+    return download(place) if isinstance(place, HubId) else place
+
+
+def locate_model(model: str | Path, root: Root = None) -> Path | HubId:
+    """As `find_model`, but downloads nothing; raises ZooError if there is no such model."""
     name, path = str(model), Path(model)
     # `Path("goop")` is always a path.
     in_zoo = isinstance(model, str) and _is_name(model) and any((zoo / model / CARD).exists() for zoo in _roots(None))
@@ -153,7 +163,7 @@ def find_model(model: str | Path, root: Root = None) -> Path:
     identifier = HubId.parse(name)
     if identifier is None:
         raise _unknown_model(name)
-    return download(identifier)
+    return identifier
 
 
 def find_entry(model: str | Path, root: Root = None) -> Path:
@@ -189,6 +199,8 @@ def _choose_variant(name: str, limits: Limits, root: Root, device: torch.device)
             damaged.append(error)
     if damaged and not cards:
         raise damaged[0]
+    from nmpm.zoo.measures.speed import measure_speed  # imports torch
+
     machine, times = limits.hardware or device_name(device), {}
     for variant, card in cards.items():
         if limits.calibrate:

@@ -23,7 +23,8 @@ from nmpm.emulator.prescribed import with_predicted
 from nmpm.errors import ZooError
 from nmpm.evaluation.bootstrap import interval
 from nmpm.metrics import MSE
-from nmpm.zoo.entries import Rows, load_entry, read_scenes
+from nmpm.zoo.entries import load_entry
+from nmpm.zoo.entry_files import Rows, read_scenes
 from nmpm.zoo.measures.ensemble import score_members
 from nmpm.zoo.measures.scenes import iterate_scenes
 from nmpm.zoo.optimization import fitting_count

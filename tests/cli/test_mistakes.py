@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from nmpm import EmulatorModule, EmulatorRecipe, TrajectoryDataModule
-from nmpm.cli import main
+from nmpm.cli import COMMANDS, main
 from nmpm.cli.early_checks import PARTS, argument_names, class_names
 
 GOOP = ["fit", "--config", "goop.yaml"]
@@ -113,7 +113,8 @@ LONG = "x" * 300
         (["trade"], "name a dataset"),
         (["trade", "sandramp"], "Did you mean sandramps"),
         (["compare", "goop", "--data", "goop", "--wider", "1"], "--wider 1: it must be at least 2"),
-        (["compare", "goop", "--data", "nothing", "--wider", "2"], "nothing cannot be widened"),
+        (["compare", "goop", "--data", "nothing", "--wider", "2"], "--data nothing: there is no such file or folder"),
+        (["compare", "goop", "--data", ".", "--wider", "2"], ". cannot be widened"),
         (["zoo", "card", "../goop"], "holds no model '../goop'"),
         (["zoo", "list", "--root", "nowhere"], "There is no zoo in nowhere"),
         (["zoo", "verify", "--data", "."], "--data is the folder of one model's data: give the model's NAME too"),
@@ -147,6 +148,7 @@ EARLY = [
     (["--model.processor=nmpm.processors.Unet"], "did you mean nmpm.processors.UNet?"),
     (["--data.path", "nowhere"], "--data.path nowhere: there is no such dataset."),
     (["--data.name", "lava"], "No embedded dataset is called 'lava'"),
+    (["--start_from", "nowhere"], "The zoo holds no model 'nowhere'"),
     (["--ckpt_path=nowhere.ckpt"], "--ckpt_path nowhere.ckpt: there is no such checkpoint."),
     (["test", "nowhere"], "nmpm test: nowhere: there is no such folder."),
     (["predict", "mine.yaml"], "mine.yaml is a file: name the folder of a run"),
@@ -155,13 +157,38 @@ EARLY = [
     (["fit", "--resume=run"], "run: there is no run/checkpoints/last.ckpt; checkpoints there: none."),
     (["fit", "--resume"], "--resume lacks the folder of a run"),
     (["fit", "run"], "to go on with a run, call nmpm fit --resume run."),
+    (["rollout", "nowhere"], "The zoo holds no model 'nowhere'"),
+    (["rollout", "gop", "--device", "cuda"], "Did you mean goop?"),
+    (["rollout", "goop", "--root", "nowhere"], "There is no zoo in nowhere"),
+    (["rollout", "goop", "--device", "abacus"], "--device abacus: it is not one of auto, cpu, cuda, mps."),
+    (["rollout", "goop", "--device", "cuda:first"], "--device cuda:first: it is not one of"),
+    (["rollout", "goop", "--data", "nowhere"], "--data nowhere: there is no such file or folder"),
+    (["rollout", "goop", "--fallback", "lava"], "There is no preset or file lava"),
+    (["demo", "nowhere"], "The zoo holds no model 'nowhere'"),
+    (["trade", "nowhere"], "DATASET nowhere: there is no such file or folder"),
+    (["trade", "goop", "--models", "goop", "nowhere"], "The zoo holds no model 'nowhere'"),
+    (["compare", "nowhere", "--data", "goop"], "The zoo holds no model 'nowhere'"),
+    (["compare", "goop", "--data", "nowhere"], "--data nowhere: there is no such file or folder"),
+    (["export", "nowhere"], "The zoo holds no model 'nowhere'"),
+    (["stress", "nowhere"], "The zoo holds no model 'nowhere'"),
+    (["stress", "goop", "--preset", "lava"], "There is no preset or file lava"),
+    (["stress", "goop", "--device", "abacus"], "--device abacus: it is not one of"),
+    (["zoo", "card", "nowhere"], "The zoo holds no model 'nowhere'"),
+    (["zoo", "verify", "nowhere"], "The zoo holds no model 'nowhere'"),
+    (["zoo", "refresh", "nowhere", "--root", "run"], "The zoo holds no model 'nowhere'"),
+    (["zoo", "refresh", "--root", "run", "--device", "abacus"], "--device abacus: it is not one of"),
+    (["zoo", "push", "nowhere", "me/goop"], "The zoo holds no model 'nowhere'"),
+    (["zoo", "match", "nowhere"], "DATA nowhere: there is no such file or folder"),
+    (["simulate", "lava"], "There is no preset or file lava"),
+    (["init", "nowhere"], "PATH nowhere: there is no such file or folder"),
 ]
+"""Words of a command, or of `nmpm fit` with goop's configuration; and what is said."""
 SCRIPT = """
 import sys, json
 from nmpm.cli import main
 for words in json.loads(sys.argv[1]):
     assert main(words)
-print("imported", sorted({"torch", "lightning"} & set(sys.modules)))
+print("imported", sorted({"torch", "lightning", "numba"} & set(sys.modules)))
 """
 
 
@@ -170,7 +197,7 @@ def test_common_mistakes_are_found_before_torch_and_lightning_are_imported(folde
     (folder / "mine.yaml").write_text("model: {cels: 3}\n")
     (folder / "run").mkdir()
     (folder / "run" / "config.yaml").write_text("model: {cells: 3}\n")
-    calls = [words if words[0] in ("fit", "validate", "test", "predict") else [*GOOP, *words] for words, _ in EARLY]
+    calls = [words if words[0] in COMMANDS else [*GOOP, *words] for words, _ in EARLY]
     done = subprocess.run([sys.executable, "-c", SCRIPT, json.dumps(calls)], capture_output=True, text=True)
     assert done.stdout == "imported []\n", done.stderr
     said = done.stderr.splitlines()
@@ -185,6 +212,7 @@ def test_common_mistakes_are_found_before_torch_and_lightning_are_imported(folde
         (["rollout", "goop", "--frames", "8", "--out", "out.h5"], {"lightning", "neuralop", "matplotlib"}),
         (["simulate", "--list"], {"lightning", "torch", "matplotlib"}),
         (["zoo", "card", "goop"], {"lightning", "matplotlib"}),
+        (["zoo", "list"], {"lightning", "torch", "matplotlib"}),
         (["fit", "--help"], {"lightning", "torch", "numpy", "jsonargparse"}),
         (["rollout", "--help"], {"torch", "numpy", "h5py"}),
         (["inspect", "--help"], {"torch", "numpy", "h5py"}),

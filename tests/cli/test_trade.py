@@ -47,11 +47,11 @@ def test_models_are_compared(tmp_path, capsys, monkeypatch):
     scenes = tiny_scenes(tmp_path / "tiny")
     model = Pretrained(tiny_emulator(scenes.scene), {})
     monkeypatch.setattr("nmpm.zoo.load_model", lambda _: model)
-    words = ["compare", "carried", "--data", str(tmp_path / "tiny"), "--out", str(tmp_path / "out")]
+    words = ["compare", "goop", "--data", str(tmp_path / "tiny"), "--out", str(tmp_path / "out")]
     monkeypatch.setattr("nmpm.evaluation.trade.shipped_sweep_text", lambda _: SWEEP)
     assert main(words) == 0
     out = capsys.readouterr().out
-    for name in ("carried", "nothing moves", "free fall", "twin: 3 of 6"):
+    for name in ("goop", "nothing moves", "free fall", "twin: 3 of 6"):
         assert name in out
     written = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"points", "compare.csv", "compare.json", "errors.png", "frames.png"} < written
@@ -62,11 +62,11 @@ def test_ensembles_stand_beside_one_rollout_in_time_and_crps(tmp_path, capsys, m
     model = Pretrained(tiny_emulator(scenes.scene), {"ensemble": {"nudge": 0.3}})
     monkeypatch.setattr("nmpm.zoo.load_model", lambda _: model)
     (tmp_path / "sweep.yaml").write_text(SWEEP)
-    words = ["trade", str(tmp_path / "tiny"), "--models", "carried", "--config", str(tmp_path / "sweep.yaml")]
+    words = ["trade", str(tmp_path / "tiny"), "--models", "goop", "--config", str(tmp_path / "sweep.yaml")]
     assert main([*words, "--members", "3", "--out", str(tmp_path / "out")]) == 0
     assert "CRPS ×10⁻³: fair" in " ".join(capsys.readouterr().out.split())
     choices = {one["name"]: one for one in json.loads((tmp_path / "out" / "trade.json").read_text())["predictors"]}
-    ensemble, single = choices["carried, 3 members"], choices["carried"]
+    ensemble, single = choices["goop, 3 members"], choices["goop"]
     assert ensemble["settings"]["nudge"] == 0.3  # the card's
     assert 0 < ensemble["errors"]["crps"]["mean"] != single["errors"]["crps"]["mean"] > 0
     assert ensemble["ms_per_frame"]["median"] > single["ms_per_frame"]["median"]

@@ -10,7 +10,7 @@ from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import ConfigError, DataError
 from nmpm.obstacles import Disc, Ramp
 from nmpm.processors import Pointwise
-from nmpm.zoo.registry import Pretrained
+from nmpm.zoo import Pretrained
 
 POSITIONS = np.random.default_rng(0).uniform(0.3, 0.7, (20, 2))
 

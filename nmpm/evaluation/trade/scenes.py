@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 
-from nmpm._support.messages import suggestion
 from nmpm.data.catalog import catalog, dataset_folder, ensure, find_simulated
 from nmpm.data.convert import Options
 from nmpm.data.generate import generate
@@ -112,19 +111,14 @@ def find_scenes(dataset: str, count: int, facts: Options | None = None) -> Scene
         facts: That files do not state.
 
     Raises:
-        ConfigError: if there is no such dataset, or facts are stated of simulated scenes.
-        DataError: if its files are missing or wrong.
+        ConfigError: if facts are stated of simulated scenes.
+        DataError: if there is no such dataset, or its files are missing or wrong.
     """
     facts = facts or Options()
     if dataset in catalog():
         _check_unstated(dataset, facts)
         folder = find_simulated(dataset, count) or ensure(dataset, {"train": 0, "valid": 0, "test": count})
         return read_scenes(dataset, FolderSource(folder), count)
-    if not Path(dataset).exists():
-        raise ConfigError(
-            f"{dataset} is neither a file or folder nor an embedded dataset: {', '.join(catalog())}."
-            f"{suggestion(dataset, catalog())}"
-        )
     return read_scenes(Path(dataset).name, FolderSource(Path(dataset), facts), count)
 
 

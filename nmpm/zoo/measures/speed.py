@@ -13,7 +13,7 @@ from nmpm.emulator import rollout
 from nmpm.errors import ZooError
 from nmpm.evaluation.machine import peak_bytes, wall_clock
 from nmpm.particles import Particles
-from nmpm.zoo.entries import read_card
+from nmpm.zoo.entry_files import read_card
 from nmpm.zoo.optimization import fitting_count
 from nmpm.zoo.pretrained import Pretrained
 
