@@ -124,6 +124,18 @@ def on_threads(function: Callable[[slice], T], rows: Sequence[slice], threads: i
         torch.set_num_threads(inner)
 
 
+def error_of_rows(
+    error: Callable[[Emulator, Particles, Window, Tensor | None], Tensor],
+    emulator: Emulator,
+    start: Particles,
+    window: Window,
+    noise: Tensor | None,
+    rows: slice,
+) -> Tensor:
+    """`error(emulator, start, window, noise)` of some of the batch's windows."""
+    return error(emulator, start.scenes(rows), window.scenes(rows), None if noise is None else noise[rows])
+
+
 def mean_over_parts(
     error: Callable[[slice], Tensor], mask: Tensor, rows: Sequence[slice], weights: Iterable[Tensor], threads: int
 ) -> Tensor:

@@ -34,7 +34,7 @@ from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.training import checkpoints, preflight
 from nmpm.training.augmentation import check_jitter, check_mirrors, mirror_half, noisy_start, with_jitter
-from nmpm.training.backpropagation import direct, mean_over_parts, predict_window
+from nmpm.training.backpropagation import direct, error_of_rows, mean_over_parts, predict_window
 from nmpm.training.budget import Clock, check_end, total_steps
 from nmpm.training.evaluation import EvaluatedModule
 from nmpm.training.losses import counted
@@ -241,7 +241,7 @@ class EmulatorModule(EvaluatedModule):
             error = self._recorded.mean_error(mean_error, self.emulator, emulator, start, batch, count)
         else:
             rows, noise = self.rows(batch), training_noise(emulator, len(start.mask), self.members, count)
-            of = lambda p: mean_error(emulator, start.scenes(p), batch.scenes(p), None if noise is None else noise[p])  # noqa: E731
+            of = partial(error_of_rows, mean_error, emulator, start, batch, noise)
             error = mean_over_parts(of, counts, rows, self.parameters(), self.threads or len(rows))
         loss, logged = global_mean(error, counts.sum() if counts.dim() == 2 else counts.sum() / counts.shape[1])
         self.log("train/loss", logged)

@@ -20,13 +20,12 @@ from nmpm.emulator import Emulator, Rollout
 from nmpm.emulator.trust import Trust, predict_trusted
 from nmpm.errors import ConfigError, UnstableError
 from nmpm.particles import Particles
-from nmpm.scene import Interval, Scene
+from nmpm.scene import Scene
 from nmpm.sim import InitialState, Preset, load_preset
 from nmpm.sim.mpm.mixture import MpmMixture
 from nmpm.sim.state import Array, Progress
+from nmpm.zoo.scenes import SAME, scene_differences
 
-_SAME = 1e-3
-"""Relative difference up to which lengths, volumes and times of model and preset are the same."""
 _LONGEST_RATIO = 64
 """Largest denominator of the ratio between the frames of model and preset."""
 
@@ -81,16 +80,7 @@ def fitting_preset(scene: Scene, state: Particles, preset: Preset) -> Preset:
         ConfigError: naming what differs: a material, the bounds, the volume of particles, what the simulator lacks; or
             obstacles that cannot be told from their particles.
     """
-    theirs = preset.scene
-    unknown = [name for name in scene.materials if name not in theirs.materials]
-    side = max(high - low for low, high in theirs.bounds)
-    differences = {
-        f"it simulates {', '.join(theirs.materials)}, not {', '.join(unknown)}": bool(unknown),
-        f"its bounds are {theirs.bounds}, the model's {scene.bounds}": not _are_near(scene.bounds, theirs.bounds, side),
-        f"its axes are {theirs.boundary}, the model's {scene.boundary}": scene.boundary != theirs.boundary,
-        f"its particles have the volume {theirs.particle_volume:g}, the model's {scene.particle_volume:g}": (
-            not math.isclose(scene.particle_volume, theirs.particle_volume, rel_tol=_SAME)
-        ),
+    differences = dict.fromkeys(scene_differences(scene, preset), True) | {
         "its particles are all of one size": state.volume is not None and bool((state.volume[state.mask] != 1).any()),
         f"it has no {', '.join(scene.fields)}": bool(scene.fields),
         "its obstacles do not move": scene.moving_obstacles,
@@ -102,13 +92,9 @@ def fitting_preset(scene: Scene, state: Particles, preset: Preset) -> Preset:
     for index in range(len(state.position)):
         preset.obstacles_from(_obstacle(state, index))
     ratio = scene.dt / preset.frame_dt
-    if math.isclose(ratio, 1.0, rel_tol=_SAME):
+    if math.isclose(ratio, 1.0, rel_tol=SAME):
         return preset
     return preset.with_stride(Fraction(ratio).limit_denominator(_LONGEST_RATIO))
-
-
-def _are_near(ours: tuple[Interval, ...], theirs: tuple[Interval, ...], side: float) -> bool:
-    return len(ours) == len(theirs) and np.allclose(ours, theirs, rtol=0, atol=_SAME * side)
 
 
 def _obstacle(state: Particles, index: int) -> Array:

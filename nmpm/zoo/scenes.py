@@ -24,8 +24,8 @@ from nmpm.zoo.states import StateBuilder
 if TYPE_CHECKING:
     from nmpm.zoo.pretrained import Pretrained
 
-_SAME = 1e-3
-"""Relative difference up to which lengths, times and volumes are the same."""
+SAME = 1e-3
+"""Relative difference up to which lengths, times and volumes of model and preset are the same."""
 
 
 def training_preset(model: Pretrained) -> Preset | None:
@@ -33,17 +33,28 @@ def training_preset(model: Pretrained) -> Preset | None:
     if model.preset not in preset_names():
         return None
     preset = load_preset(str(model.preset))
-    return preset if _is_same(model.scene, preset.scene) else None
+    ours, theirs = model.scene, preset.scene
+    same = ours.materials == theirs.materials and ours.gravity_varies == theirs.gravity_varies
+    same_frames = math.isclose(ours.dt, theirs.dt, rel_tol=SAME)
+    return preset if same and same_frames and not scene_differences(ours, preset) else None
 
 
-def _is_same(one: Scene, other: Scene) -> bool:
-    facts = [(scene.materials, scene.boundary, scene.dim, scene.gravity_varies) for scene in (one, other)]
-    return (
-        facts[0] == facts[1]
-        and np.allclose(one.bounds, other.bounds, rtol=_SAME, atol=_SAME)
-        and math.isclose(one.dt, other.dt, rel_tol=_SAME)
-        and math.isclose(one.particle_volume, other.particle_volume, rel_tol=_SAME)
-    )
+def scene_differences(scene: Scene, preset: Preset) -> list[str]:
+    """Why a preset does not simulate a model's scenes: materials that it lacks, bounds, axes, volume of particles."""
+    theirs = preset.scene
+    unknown = [name for name in scene.materials if name not in theirs.materials]
+    nearest = SAME * max(high - low for low, high in theirs.bounds)
+    same_bounds = scene.dim == theirs.dim and np.allclose(scene.bounds, theirs.bounds, rtol=0, atol=nearest)
+    same_volume = math.isclose(scene.particle_volume, theirs.particle_volume, rel_tol=SAME)
+    differences = {
+        f"it simulates {', '.join(theirs.materials)}, not {', '.join(unknown)}": bool(unknown),
+        f"its bounds are {theirs.bounds}, the model's {scene.bounds}": not same_bounds,
+        f"its axes are {theirs.boundary}, the model's {scene.boundary}": scene.boundary != theirs.boundary,
+        f"its particles have the volume {theirs.particle_volume:g}, the model's {scene.particle_volume:g}": (
+            not same_volume
+        ),
+    }
+    return [difference for difference, differs in differences.items() if differs]
 
 
 def simulate_scene(
