@@ -1,5 +1,6 @@
 """The viewer's page in headless Chromium: what a person clicks, presses and sees."""
 
+import base64
 import dataclasses
 import io
 
@@ -231,3 +232,43 @@ def test_pictures_and_films_are_saved(open_page, tmp_path):
     saved.value.save_as(tmp_path / "a.webm")
     assert (tmp_path / "a.webm").read_bytes()[:4] == bytes.fromhex("1a45dfa3")  # EBML, of which WebM is
     assert saved.value.suggested_filename == "nmpm.webm"
+
+
+def test_animations_are_saved_as_gif(open_page, tmp_path):
+    page = open_page(one_particle(frames=12))
+    page.evaluate("element('rate').value = 15")
+    with page.expect_download() as saved:
+        page.click("#gif")
+    saved.value.save_as(tmp_path / "a.gif")
+    animation = Image.open(tmp_path / "a.gif")
+    assert animation.n_frames == 12
+    assert animation.info["duration"] == pytest.approx(1000 / 15, abs=5)
+    assert animation.size[0] <= 720
+    shown = []
+    for frame in range(12):
+        animation.seek(frame)
+        pixels = np.asarray(animation.convert("RGB")).astype(int)
+        shown.append(np.argwhere(np.abs(pixels - WATER).sum(axis=2) < 40).mean(axis=0))
+    assert np.isfinite(shown).all()
+    assert abs(np.diff(shown, axis=0)).max(axis=1).min() > 0  # it moves
+
+
+@pytest.mark.parametrize("colours", [1, 2, 256, 5000])
+def test_gifs_hold_the_colours_that_they_are_given(open_page, colours):
+    page = open_page(one_particle(frames=3))
+    rng = np.random.default_rng(colours)
+    palette = rng.integers(0, 256, (colours, 3))
+    image = np.dstack([palette[rng.integers(colours, size=(150, 131))], np.full((150, 131), 255)]).astype(np.uint8)
+    text = base64.b64encode(image.tobytes()).decode()
+    made = page.evaluate(
+        """async (text) => {
+          const gif = new Gif(131, 150);
+          gif.add(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)), 4);
+          return Array.from(new Uint8Array(await gif.blob().arrayBuffer()));
+        }""",
+        text,
+    )
+    decoded = np.asarray(Image.open(io.BytesIO(bytes(made))).convert("RGB")).astype(int)
+    apart = abs(decoded - image[..., :3]).max(axis=2)
+    assert apart.max() <= (8 if colours <= 256 else 80)
+    assert apart.mean() < 20

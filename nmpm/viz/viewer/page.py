@@ -28,7 +28,7 @@ from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
 SCRIPTS = (
     "data.js", "matrices.js", "drawing.js", "density.js", "layout.js", "curve.js", "legend.js", "ensemble.js",
-    "saving.js", "pointer.js", "viewer.js",
+    "gif.js", "saving.js", "pointer.js", "viewer.js",
 )  # fmt: skip
 COLOUR_SCALE = "YlGnBu_r"
 TOP_PERCENTILE = 99.0

@@ -1,6 +1,7 @@
-// Saving what is shown: a picture (PNG), or a film of all frames (WebM).
+// Saving what is shown: a picture (PNG), or all frames as a film (WebM) or an animation (GIF).
 
 const HEAD = 30; // pixels above the panels, for the title
+const GIF_WIDTH = 720, GIF_PICTURES = 250, GIF_RATE = 25; // at most so many pixels, pictures, and pictures per second
 
 /** Hands a file over to the browser's downloads. */
 function download(blob, suffix) {
@@ -65,4 +66,31 @@ function saveFilm(viewer) {
   button.classList.add("recording");
   recorder.start();
   viewer.toggle();
+}
+
+/** All frames as a GIF, at the chosen speed; once more ends it early. */
+async function saveGif(viewer) {
+  if (viewer.animating) return (viewer.animating = false);
+  const canvas = document.createElement("canvas"), small = document.createElement("canvas");
+  const every = Math.ceil(Math.max(viewer.rate / GIF_RATE, viewer.frames / GIF_PICTURES)), last = viewer.frame;
+  let gif, context;
+  viewer.animating = true;
+  element("gif").classList.add("recording");
+  for (let frame = 0; frame < viewer.frames && viewer.animating; frame += every) {
+    viewer.stopAt(frame);
+    viewer.draw();
+    compose(viewer, canvas);
+    if (!gif) {
+      const scale = Math.min(1, GIF_WIDTH / canvas.width);
+      [small.width, small.height] = [canvas.width, canvas.height].map((length) => Math.round(length * scale));
+      [gif, context] = [new Gif(small.width, small.height), small.getContext("2d", { willReadFrequently: true })];
+    }
+    context.drawImage(canvas, 0, 0, small.width, small.height);
+    gif.add(context.getImageData(0, 0, small.width, small.height).data, Math.max(2, Math.round((100 * every) / viewer.rate)));
+    await new Promise((resolve) => setTimeout(resolve));
+  }
+  viewer.animating = false;
+  element("gif").classList.remove("recording");
+  viewer.stopAt(last);
+  download(gif.blob(), "gif");
 }

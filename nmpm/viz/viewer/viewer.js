@@ -58,6 +58,7 @@ class Viewer {
     on("curve", "click", (event) => this.stopAt(frameAt(element("curve"), event.offsetX)));
     on("picture", "click", () => savePicture(this));
     on("film", "click", () => saveFilm(this));
+    on("gif", "click", () => saveGif(this));
     document.addEventListener("keydown", (event) => this.press(event));
   }
 
@@ -71,7 +72,7 @@ class Viewer {
       Home: () => this.stopAt(0), End: () => this.stopAt(this.frames - 1), "[": () => this.changeRate(-1), "]": () => this.changeRate(1),
       c: () => this.setColour(next(element("colour"))), o: () => this.setLayout(next(element("layout"))),
       m: () => this.ensemble && this.setMembers(next(element("members"))), r: () => this.reset(), t: () => this.turnTheme(), f: () => document.documentElement.requestFullscreen(),
-      p: () => savePicture(this), v: () => saveFilm(this),
+      p: () => savePicture(this), v: () => saveFilm(this), g: () => saveGif(this),
       "?": () => element("keys").showModal(),
     };
     const action = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
