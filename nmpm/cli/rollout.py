@@ -231,6 +231,10 @@ def _check(options: argparse.Namespace) -> None:
     """Check the numbers and paths before anything is loaded."""
     for name, least in (("frames", 1), ("threads", 1), ("particles", 1), ("blocks", 1), ("seed", 0), ("trajectory", 0)):
         check_at_least(f"--{name}", getattr(options, name), least)
+    if options.fallback is not None:
+        find_preset(options.fallback)
+    check_model(options.model, options.root)
+    check_device(options.device)
     match = MatchOptions.read(options.materials, options.stride, options.strict)
     data_options(options)
     if options.data is not None:
@@ -240,10 +244,6 @@ def _check(options: argparse.Namespace) -> None:
     elif facts := [fact for fact in stated_facts(options) if not fact.startswith("--gravity")]:
         raise ConfigError(f"{facts[0]} is about recorded data: give --data too.")
     _check_members(options)
-    if options.fallback is not None:
-        find_preset(options.fallback)
-    check_model(options.model, options.root)
-    check_device(options.device)
 
 
 def _check_members(options: argparse.Namespace) -> None:

@@ -101,15 +101,15 @@ def add_scene_options(parser: argparse.ArgumentParser, command: str, scenes: int
 
 def measure_and_report(command: str, options: argparse.Namespace, dataset: str) -> None:
     """Measure the sweep of a command on a dataset, print the table, and write the report."""
+    for name in options.models or ():
+        check_model(name)
+    check_device(options.device)
     match, facts = MatchOptions.read(options.materials, options.stride, options.strict), data_options(options)
     check_at_least("--scenes", options.scenes, 1)
     check_at_least("--wider", options.wider, 2)
     check_at_least("--members", options.members, 1)
     if options.wider and (stated := stated_facts(options)):
         raise ConfigError(f"{stated[0]}: --wider simulates scenes, and their facts are known: leave it out.")
-    for name in options.models or ():
-        check_model(name)
-    check_device(options.device)
     wider = f"-{options.wider}-times-as-wide" if options.wider else ""
     out = options.out or Path(command) / f"{Path(dataset).name}{wider}"
     check_folder("--out", out)
