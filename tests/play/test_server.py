@@ -4,6 +4,7 @@ import asyncio
 import http.client
 import json
 import threading
+import time
 
 import pytest
 
@@ -145,6 +146,25 @@ def test_start_throw_drag_pour_close(page, server):
     wait_until(page, "document.getElementById('rate').textContent.includes('pictures/s')")
     page.close()
     assert get(server, f"/{server.token}/")[0] == 200  # another page may be opened
+
+
+def test_a_body_comes_to_rest_under_the_pointer_that_holds_it(page, server):
+    body = page.evaluate("play.stage.bodies[0]")
+    page.mouse.move(*at(page, body["centre"]))
+    page.mouse.down()
+    for goal in ([0.45, 0.6], [0.5, 0.7]):  # faster than moves are sent
+        page.mouse.move(*at(page, goal))
+    wait_until(page, "play.stage.bodies[0].centre[1] > 0.68")
+    wait_for(lambda: abs(server.session.world.bodies[body["id"]].centre[1] - 0.7) < 0.01)
+    page.mouse.up()
+
+
+def wait_for(condition):
+    for _ in range(200):
+        if condition():
+            return
+        time.sleep(0.025)
+    pytest.fail("not within 5 s")
 
 
 def test_the_page_says_what_was_wrong(page):

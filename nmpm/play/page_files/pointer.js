@@ -63,6 +63,7 @@ class Pointer {
   release(event, completed) {
     const { action } = this;
     this.action = null;
+    clearTimeout(this.later);
     this.stage.canvas.classList.remove("held");
     if (action?.kind === "pour") this.send({ do: "stop" });
     else if (action?.kind === "throw" && completed) this.throw(action);
@@ -112,11 +113,12 @@ class Pointer {
 
   sendBody({ id, centre, angle = 0 }) { this.send({ do: "move", body: id, centre, angle }); }
 
-  /** Does something now, unless it was done a moment ago. */
+  /** Does something now, or a little later if something was done a moment ago; of several that wait, the last. */
   sometimes(doIt) {
-    const now = performance.now();
-    if (now - this.moved < MOVES) return;
-    this.moved = now;
+    clearTimeout(this.later);
+    const wait = this.moved + MOVES - performance.now();
+    if (wait > 0) return (this.later = setTimeout(() => this.sometimes(doIt), wait));
+    this.moved = performance.now();
     doIt();
   }
 
