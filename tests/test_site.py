@@ -75,7 +75,7 @@ def build(folder: Path) -> None:
 
 
 def test_the_site_builds_and_fetches_nothing(tmp_path):
-    for package in ("mkdocs", "material", "mkdocstrings"):
+    for package in ("mkdocs", "material", "mkdocstrings", "onnxscript"):
         pytest.importorskip(package, reason=f'{package} is not installed: pip install "nmpm[docs]"')
     build(tmp_path)
     pages = {path.relative_to(tmp_path).as_posix(): path.read_text("utf-8") for path in tmp_path.glob("**/*.html")}
@@ -88,6 +88,8 @@ def test_the_site_builds_and_fetches_nothing(tmp_path):
     assert all(
         (tmp_path / "gallery" / f"{name.replace('/', '-')}.html").stat().st_size < 1_500_000 for name in Zoo.list()
     )
+    assert 'src="play/index.html"' in pages["play.html"]
+    assert (tmp_path / "play" / "model.onnx").stat().st_size < 600_000
     assert 'src="quickstart-1.png"' in pages["notebooks/quickstart.html"]
     assert 'rel="next"' in pages["zoo/goop/index.html"]
     first = [pages["reference/nmpm.html"].index(f'id="nmpm.{name}"') for name in ("Zoo", "rollout", "Emulator")]

@@ -29,8 +29,11 @@ def page(names: list[str]) -> str:
         f'<iframe src="gallery/{_file(name)}" title="{name}" loading="lazy" class="player"></iframe>'
         for name in names
     ]
-    head = "# Gallery\n\nA rollout of each model, from a scene of its own kind that it has not seen; `nmpm demo NAME`"
-    return "\n\n".join([f"{head} sets the\nsimulator beside it, `nmpm play NAME` lets you interfere.", *parts]) + "\n"
+    head = (
+        "# Gallery\n\nA rollout of each model, from a scene of its own kind that it has not seen; `nmpm demo NAME` sets"
+        "\nthe simulator beside it, `nmpm play NAME` lets you interfere; one model [plays in your browser](play.md)."
+    )
+    return "\n\n".join([head, *parts]) + "\n"
 
 
 def player(name: str, frames: int) -> str:

@@ -138,6 +138,8 @@ def write_onnx(part: Part, metadata: Mapping[str, str], path: Path) -> None:
             f" transfer: {_reason(error)}. --format pt2 supports all that torch.export does."
         ) from error
     model: ModelProto = written.model_proto
+    for node in model.graph.node:
+        del node.metadata_props[:]  # stack traces: three quarters of the file, with paths of this machine
     _name_sizes(model, (*part.inputs, *part.outputs))
     onnx.helper.set_model_props(model, dict(metadata))
     with atomic_write(path) as temporary:
