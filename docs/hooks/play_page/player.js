@@ -7,7 +7,8 @@ const SAID = 6000; // milliseconds that a line stays
 
 class Player {
   constructor() {
-    Object.assign(this, { tool: "throw", material: 0, playing: true, run: 0, call: 0, pictures: [], due: 0 });
+    Object.assign(this, { tool: "throw", material: 0, playing: true, run: 0, call: 0, pictures: [], due: 0, pace: scene.pace });
+    scene.pace = 1; // each frame is given to the stage, so that its speeds are those of one frame
     this.stage = new Stage();
     this.stage.onDrawn = (now) => this.count(now);
     this.stage.setColours(Uint8Array.from({ length: 6 * scene.most }, (_, i) => 255 * readColour(scene.materials[0].colour)[i % 3]));
@@ -73,15 +74,15 @@ class Player {
   tick(now) {
     const passed = Math.min(now - this.before, 100);
     this.before = now;
-    this.due = this.playing ? this.due + (passed * RATE * scene.pace) / 1000 : 0;
+    this.due = this.playing ? this.due + (passed * RATE * this.pace) / 1000 : 0;
     while (this.due >= 1 && this.advance()) this.due -= 1;
-    this.due = Math.min(this.due, scene.pace);
+    this.due = Math.min(this.due, this.pace);
     requestAnimationFrame((time) => this.tick(time));
   }
 
   /** A frame on; false while it is being computed. */
   advance() {
-    const soon = (1000 * this.left) / (RATE * scene.pace) < HURRY * this.call + MARGIN;
+    const soon = (1000 * this.left) / (RATE * this.pace) < HURRY * this.call + MARGIN;
     if (!this.asked && soon) this.ask();
     if (this.left) this.index += 1;
     else if (this.next) this.begin();
@@ -144,7 +145,7 @@ class Player {
   fill() {
     element("title").textContent = scene.title;
     element("pace").replaceChildren(...PACES.map((pace) => new Option(`${Number((RATE * pace * scene.dt).toPrecision(2))} × real time`, pace)));
-    element("pace").value = scene.pace;
+    element("pace").value = this.pace;
     this.setPlaying(true);
     const file = location.protocol === "file:";
     element("start").disabled = file;
@@ -157,7 +158,7 @@ class Player {
     on("play", "click", () => this.setPlaying(!this.playing));
     on("step", "click", () => this.step());
     on("restart", "click", () => this.restart());
-    on("pace", "change", () => (scene.pace = Number(element("pace").value)));
+    on("pace", "change", () => (this.pace = Number(element("pace").value)));
     on("theme", "click", () => this.stage.setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark"));
     on("colour", "change", () => this.showLegend());
     document.addEventListener("keydown", (event) => this.press(event));
