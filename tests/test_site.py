@@ -68,12 +68,13 @@ def build(folder: Path) -> None:
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        timeout=270,
+        timeout=570,
         check=False,
     )
     assert run.returncode == 0, run.stdout[-4000:]
 
 
+@pytest.mark.timeout(600)
 def test_the_site_builds_and_fetches_nothing(tmp_path):
     for package in ("mkdocs", "material", "mkdocstrings", "onnxscript"):
         pytest.importorskip(package, reason=f'{package} is not installed: pip install "nmpm[docs]"')
