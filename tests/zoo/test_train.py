@@ -61,4 +61,4 @@ def test_the_queue_names_models_once_and_configurations_that_exist(script, capsy
     )
     assert all((REPOSITORY / "configs" / model["config"]).is_file() for model in queue)
     assert script.main(["--dry-run", "--runs", str(tmp_path)]) == 0
-    assert capsys.readouterr().out.count("nmpm fit") == 28
+    assert capsys.readouterr().out.count("nmpm fit") == 29
