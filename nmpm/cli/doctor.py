@@ -23,7 +23,7 @@ examples:
   nmpm doctor --device cuda     test the GPU
   nmpm doctor > doctor.txt      to attach it
 
-The self-test takes less than a minute where kernels have been compiled before; the first one compiles them, for minutes.
+The self-test takes less than a minute where kernels have been compiled before; the first compiles them, in minutes.
 """
 WIDTH = 14
 
