@@ -77,11 +77,11 @@ def browser():
 
 def wait_until(page, condition):
     """Waits for a JavaScript condition (pages' policies forbid playwright's own way, which evaluates text)."""
-    for _ in range(200):
+    for _ in range(800):
         if page.evaluate(condition):
             return
         page.wait_for_timeout(25)
-    pytest.fail(f"not within 5 s: {condition}")
+    pytest.fail(f"not within 20 s: {condition}")
 
 
 @pytest.fixture
