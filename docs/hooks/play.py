@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import json
 import tempfile
-from importlib.resources import files as package_files
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -20,7 +19,7 @@ from torch import Tensor
 
 from nmpm import Zoo
 from nmpm.play.limits import Limits
-from nmpm.play.page import VIEWER, VIEWER_SCRIPTS
+from nmpm.play.page import fill, scripts
 from nmpm.play.pictures import page_scene
 from nmpm.zoo import Pretrained
 from nmpm.zoo.export import FORMATS, Step, description
@@ -36,7 +35,6 @@ RUNTIME = (
 )
 """Files of `VERSION` of the npm package onnxruntime-web (its smallest build), with their subresource integrity."""
 HERE = Path(__file__).parent / "play_page"
-PLAY = "nmpm.play.page_files"
 PLAY_SCRIPTS = ("stage.js", "bodies.js", "pointer.js")
 
 
@@ -58,17 +56,12 @@ def page_files(runtime: str) -> dict[str, str | bytes]:
 
 def page(model: Pretrained, runtime: str) -> str:
     """The page's text, with the viewer's scripts for drawing and those of `nmpm play` for the pointer."""
-    scripts = [*(_read(VIEWER, name) for name in VIEWER_SCRIPTS), *(_read(PLAY, name) for name in PLAY_SCRIPTS)]
     own = (HERE / "player.js").read_text(encoding="utf-8")
-    text = (HERE / "page.html").read_text(encoding="utf-8")
-    for mark, content in {
-        "/*STYLE*/": _read(VIEWER, "style.css") + _read(PLAY, "play.css"),
+    contents = {
         "/*SCENE*/": json.dumps(described(model, runtime)),
-        "/*SCRIPT*/": "\n".join([*scripts, own]),
-    }.items():
-        before, after = text.split(mark)
-        text = before + content + after
-    return text
+        "/*SCRIPT*/": f"{scripts(PLAY_SCRIPTS)}\n{own}",
+    }
+    return fill((HERE / "page.html").read_text(encoding="utf-8"), contents)
 
 
 def described(model: Pretrained, runtime: str) -> dict[str, Any]:
@@ -110,10 +103,6 @@ def site_page(runtime: str) -> str:
         f" worker, on one thread. Start loads [onnxruntime-web {VERSION}]({npm}) from `{runtime}`, pinned by its hash."
         " The model gives 16 frames at once: a thrown block begins to move with the next call.\n"
     )
-
-
-def _read(package: str, name: str) -> str:
-    return package_files(package).joinpath(name).read_text(encoding="utf-8")
 
 
 def _base64(values: Tensor) -> str:

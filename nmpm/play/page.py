@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.resources import files
 
@@ -14,15 +15,21 @@ SCRIPTS = ("stage.js", "bodies.js", "pointer.js", "play.js")
 @cache
 def page() -> str:
     """The page's text."""
-    text, style = _read("play.html"), _read("play.css")
-    viewer = [_read(name, VIEWER) for name in VIEWER_SCRIPTS]
-    for mark, content in {
-        "/*STYLE*/": _read("style.css", VIEWER) + style,
-        "/*SCRIPT*/": "\n".join([*viewer, *map(_read, SCRIPTS)]),
-    }.items():
+    return fill(read("play.html"), {"/*SCRIPT*/": scripts(SCRIPTS)})
+
+
+def fill(text: str, contents: Mapping[str, str]) -> str:
+    """A page's text with its style, and with contents in place of their marks."""
+    style = read("style.css", VIEWER) + read("play.css")
+    for mark, content in {"/*STYLE*/": style, **contents}.items():
         before, after = text.split(mark)
         text = before + content + after
     return text
+
+
+def scripts(own: Iterable[str]) -> str:
+    """The viewer's scripts for drawing, then some of this package's."""
+    return "\n".join([*(read(name, VIEWER) for name in VIEWER_SCRIPTS), *map(read, own)])
 
 
 def policy() -> str:
@@ -32,5 +39,6 @@ def policy() -> str:
     return "; ".join((*rules, "connect-src 'self'", *closed))
 
 
-def _read(name: str, package: str = f"{__package__}.page_files") -> str:
+def read(name: str, package: str = f"{__package__}.page_files") -> str:
+    """The text of a file of a package, of this one's page when left out."""
     return files(package).joinpath(name).read_text(encoding="utf-8")
