@@ -40,8 +40,7 @@ B = TypeVar("B", Particles, Window)
 
 @dataclass(frozen=True)
 class EnsembleError:
-    """The fair energy score of each particle's position in each frame, with the fair CRPS of the density of each cell
-    at the last frame of each bundle.
+    """The fair energy score of single particles' positions, with the fair CRPS of cells' densities where bundles end.
 
     Args:
         members: M, at least 2, of each window. They follow each other in a batch.
