@@ -202,7 +202,7 @@ def _fits(value: Any, kind: Any) -> bool:
     if len(options) > 1:
         return any(_fits(value, option) for option in options)
     if origin is Literal:
-        return value in inner
+        return (type(value), value) in [(type(choice), choice) for choice in inner]  # 1 == 1.0 == True
     if origin is tuple:
         kinds = inner[:1] * len(value) if isinstance(value, tuple) and inner[-1] is ... else inner
         return isinstance(value, tuple) and len(value) == len(kinds) and all(map(_fits, value, kinds))

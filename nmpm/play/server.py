@@ -97,11 +97,13 @@ class PlayServer:
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The page, or a refusal; None for a WebSocket that may be opened."""
         here = f"{HOST}:{self.port}"
-        path, host = request.path.encode(), request.headers.get("Host", "")
-        if host not in (here, f"localhost:{self.port}"):  # names that others have pointed at this machine
+        path, hosts, origins = request.path.encode(), *map(request.headers.get_all, ("Host", "Origin"))
+        if max(len(hosts), len(origins)) > 1:
+            return connection.respond(HTTPStatus.BAD_REQUEST, "Host and Origin may be stated once.\n")
+        if (hosts or [""])[0] not in (here, f"localhost:{self.port}"):  # names that others have pointed at this machine
             return connection.respond(HTTPStatus.FORBIDDEN, "This server is reached by the address that it printed.\n")
         if secrets.compare_digest(path, f"/{self.token}/socket".encode()):
-            known = request.headers.get("Origin") in (f"http://{here}", f"http://localhost:{self.port}")
+            known = (origins or [""])[0] in (f"http://{here}", f"http://localhost:{self.port}")
             return None if known else connection.respond(HTTPStatus.FORBIDDEN, "Another page may not play here.\n")
         if secrets.compare_digest(path, f"/{self.token}/".encode()):
             return _html(page())

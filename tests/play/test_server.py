@@ -66,6 +66,16 @@ def test_the_page_needs_the_token_and_the_name_of_this_machine(server):
     assert get(server, f"/{server.token}/", host="evil.example")[0] == 403
 
 
+@pytest.mark.parametrize("name", ["Host", "Origin"])
+def test_a_header_that_is_stated_twice_is_a_bad_request(server, name):
+    connection = http.client.HTTPConnection(HOST, server.port, timeout=30)
+    connection.putrequest("GET", f"/{server.token}/", skip_host=True)
+    for host in (f"{HOST}:{server.port}", "evil.example"):
+        connection.putheader(name, host)
+    connection.endheaders()
+    assert connection.getresponse().status == 400
+
+
 def test_the_socket_needs_the_token_and_the_page(server):
     for changes in ({"token": "wrong"}, {"origin": "http://evil.example"}):
         with pytest.raises(InvalidStatus):

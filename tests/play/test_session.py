@@ -6,12 +6,15 @@ import random
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from nmpm.data.convert import native_file
 from nmpm.data.format import Split
 from nmpm.play import pictures
 from nmpm.play import session as sessions
 from nmpm.viz.viewer import page_of_files
+from tests.data import fuzzing
 
 
 def room(player):
@@ -278,3 +281,70 @@ def test_a_thousand_malformed_messages_leave_the_session_running(play):
     player.tick(3)
     assert player.session.frame > frame
     assert np.isfinite(player.position).all()
+
+
+MESSAGES = (
+    {"do": "throw", "material": 0, "at": [0.5, 0.8], "sides": [0.05, 0.05], "velocity": [0.1, 0.0]},
+    {"do": "pour", "material": 0, "at": [0.5, 0.8], "velocity": [0.0, -0.5], "width": 0.05},
+    {"do": "stop"},
+    {"do": "move", "body": 0, "centre": [0.5, 0.5], "angle": 0.3},
+    {"do": "put", "kind": "disc", "centre": [0.5, 0.5]},
+    {"do": "remove", "body": 1},
+    {"do": "gravity", "vector": [0.0, -9.81]},
+    {"do": "play", "on": False},
+    {"do": "step"},
+    {"do": "pace", "frames": 1},
+    {"do": "restart", "seed": 1},
+    {"do": "beside", "on": True},
+    {"do": "seen", "picture": 0},
+)  # fmt: skip
+NUMBERS = (
+    st.sampled_from([0, 1, 1.0, True, False, -1, 2, 4.0, 1e-300, 1e999, -1e999, float("nan"), 2**31, 10**30])
+    | st.integers() | st.floats() | st.floats(0, 1)
+)  # fmt: skip
+
+
+@st.composite
+def mutated_messages(draw) -> str | bytes:
+    """A message with some of its values or its text changed, or one that is none."""
+    message = draw(st.sampled_from(MESSAGES) | st.dictionaries(st.text(max_size=6), fuzzing.VALUES, max_size=4))
+    for _ in range(draw(st.integers(0, 2))):
+        if found := list(fuzzing.places(message)):
+            value = draw(NUMBERS | st.lists(NUMBERS, max_size=4) | fuzzing.VALUES)
+            message = fuzzing.changed(message, draw(st.sampled_from(found)), value)
+    text = json.dumps(message)
+    if draw(st.booleans()) and draw(st.booleans()):
+        return fuzzing.damage(text.encode(), fuzzing.random_changes(random.Random(draw(st.integers(0, 10**6)))))
+    return text
+
+
+def receive_mutated(player, monkeypatch, count):
+    monkeypatch.setattr(sessions.Session, "save", lambda session: None)
+
+    @settings(fuzzing.FUZZ, max_examples=count)
+    @given(mutated_messages())
+    def receive(message):
+        player.session.receive(message)
+        player.tick()
+
+    receive()
+    assert player.do("pace", frames=1) is None
+    assert np.isfinite(player.position).all()
+
+
+def test_no_message_ends_a_session(play, monkeypatch):
+    receive_mutated(play(), monkeypatch, 60)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["waterramps", "goop"])
+def test_thousands_of_messages_end_no_session(play, monkeypatch, preset):
+    receive_mutated(play(preset), monkeypatch, 3000)
+
+
+@pytest.mark.parametrize("frames", [1.0, True, 4.0, "1", [1]])
+def test_a_pace_is_a_whole_number(play, frames):
+    player = play()
+    assert "should be one of 1, 2, 4" in player.do("pace", frames=frames)
+    player.tick(3)
+    assert player.do("pace", frames=2) is None
