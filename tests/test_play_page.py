@@ -18,12 +18,13 @@ import numpy as np
 import pytest
 
 from nmpm import Zoo
+from nmpm._support.messages import install
 from tests.conftest import wait_until
 from tests.test_site import load_hook
 
 RUNTIME = "runtime/"
 CELLS = 1e-3  # largest difference from Python's rollout over a bundle: what `nmpm export` allows, too
-pytest.importorskip("mkdocs", reason='mkdocs is not installed: pip install "nmpm[docs]"')
+pytest.importorskip("mkdocs", reason=install("docs"))
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +69,7 @@ def runtime():
     folder = os.environ.get("NMPM_ONNXRUNTIME_WEB")
     if not folder:
         pytest.skip("NMPM_ONNXRUNTIME_WEB does not name the folder of onnxruntime-web's files")
-    pytest.importorskip("onnxscript", reason='onnxscript is not installed: pip install "nmpm[export]"')
+    pytest.importorskip("onnxscript", reason=install("export"))
     return Path(folder)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from nmpm import Zoo
+from nmpm._support.messages import install
 
 ROOT = Path(__file__).parent.parent
 PAGES = [
@@ -35,7 +36,7 @@ def anchors(path: Path) -> set[str]:
 
 def load_hook(name: str):
     """A hook of the site, as MkDocs loads it."""
-    pytest.importorskip("mkdocs", reason='mkdocs is not installed: pip install "nmpm[docs]"')
+    pytest.importorskip("mkdocs", reason=install("docs"))
     spec = importlib.util.spec_from_file_location(f"docs_hook_{name}", ROOT / "docs" / "hooks" / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -77,7 +78,7 @@ def build(folder: Path) -> None:
 @pytest.mark.timeout(600)
 def test_the_site_builds_and_fetches_nothing(tmp_path):
     for package in ("mkdocs", "material", "mkdocstrings", "onnxscript"):
-        pytest.importorskip(package, reason=f'{package} is not installed: pip install "nmpm[docs]"')
+        pytest.importorskip(package, reason=f"{package} is not installed: {install('docs')}")
     build(tmp_path)
     pages = {path.relative_to(tmp_path).as_posix(): path.read_text("utf-8") for path in tmp_path.glob("**/*.html")}
     sources = {path.relative_to(ROOT / "docs") for path in (ROOT / "docs").glob("**/*.md")}

@@ -19,6 +19,11 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
+def install(extra: str) -> str:
+    """The command that installs an optional dependency, such as `pip install -e ".[play]"`."""
+    return f'pip install -e ".[{extra}]" in the clone of nmpm'
+
+
 def suggestion(name: str, known: Iterable[str]) -> str:
     """The sentence "Did you mean …?" after a space, with the nearest known names; empty if none is near."""
     near = get_close_matches(name, list(known), n=3)

@@ -86,7 +86,7 @@ def add_runtime_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--runtime",
         default="eager",
-        help="what computes the network: eager (torch, default), openvino (CPU, nmpm[openvino]), windows (for"
+        help="what computes the network: eager (torch, default), openvino (CPU, the extra of that name), windows (for"
         " large scenes that are mostly empty), or auto for the faster of eager and openvino here",
     )
 

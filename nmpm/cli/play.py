@@ -7,6 +7,7 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
+from nmpm._support.messages import install
 from nmpm.cli.options import (
     HelpFormatter,
     add_device_option,
@@ -92,7 +93,7 @@ def _parser() -> argparse.ArgumentParser:
 def _check(options: argparse.Namespace) -> None:
     """Check what needs no torch."""
     if find_spec("websockets") is None:
-        raise ConfigError('the page needs a package that is not installed: pip install "nmpm[play]".')
+        raise ConfigError(f"the page needs a package that is not installed: {install('play')}.")
     check_at_least("--seed", options.seed, 0)
     check_at_least("--threads", options.threads, 1)
     if not 0 <= options.port <= 65535:

@@ -6,6 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from nmpm._support.messages import install
 from nmpm.cli.options import HelpFormatter, add_split_option, add_style_option, check_exists, derived_name
 from nmpm.errors import ConfigError
 
@@ -40,7 +41,7 @@ def run(words: list[str]) -> None:
     )
     parser.add_argument("--family", help="meaning of type ids if metadata.json lacks it: deepmind, lagrangebench")
     add_style_option(parser, "the snapshots, in place of the PNG,")
-    parser.add_argument("--mp4", action="store_true", help='an MP4 in place of the GIF (pip install "nmpm[video]")')
+    parser.add_argument("--mp4", action="store_true", help=f"an MP4 in place of the GIF ({install('video')})")
     parser.add_argument("--out", type=Path, help="path of the pictures without suffix (default: that of the file)")
     arguments = parser.parse_args(words[1:])
     from nmpm.data.convert import Options, native_file

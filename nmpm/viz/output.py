@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from nmpm._support.atomic import atomic_write, file_obstacle
+from nmpm._support.messages import install
 from nmpm.errors import ConfigError, DataError
 
 
@@ -54,7 +55,7 @@ def check_output(path: Path, suffixes: Sequence[str]) -> str:
             get_ffmpeg_exe()
         except (ImportError, RuntimeError) as error:
             raise ConfigError(
-                'MP4 needs a video encoder that is not installed: pip install "nmpm[video]", or write a .gif instead.'
+                f"MP4 needs a video encoder that is not installed: {install('video')}; or write a .gif instead."
             ) from error
     if obstacle := file_obstacle(path):
         raise DataError(f"Cannot write {path}: {obstacle}")

@@ -221,7 +221,7 @@ class Pretrained(Predictor):
 
         Args:
             runtime: One of `nmpm.emulator.runtimes.RUNTIMES`, by name or made with options: "openvino" (CPU, needs
-                `nmpm[openvino]`), "windows" (large scenes that are mostly empty), or "eager", torch itself; "auto" for
+                extra `openvino`), "windows" (large scenes that are mostly empty), or "eager", torch itself; "auto" for
                 the faster of openvino and eager here, as measured in short rollouts. On a CUDA GPU calls by eager are
                 recorded as CUDA graphs without being asked.
             precision: As for `with_network`; the network's own if left out.

@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from nmpm._support.messages import install
 from nmpm.cli import main
 
 WITHOUT = """
@@ -21,7 +22,7 @@ sys.exit(status)
 def test_without_its_library_it_says_so_before_torch_is_imported():
     ended = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True)
     assert ended.returncode == 1
-    assert ended.stderr == ('nmpm play: the page needs a package that is not installed: pip install "nmpm[play]".\n')
+    assert ended.stderr == (f"nmpm play: the page needs a package that is not installed: {install('play')}.\n")
 
 
 @pytest.mark.parametrize(

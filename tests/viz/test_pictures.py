@@ -244,7 +244,7 @@ def test_render_writes_snapshots_for_slides_and_print(style, file, start):
     ("words", "message"),
     [
         (["--out", "missing/a"], "the folder missing does not exist"),
-        (["--mp4"], 'pip install "nmpm[video]"'),
+        (["--mp4"], 'pip install -e ".[video]"'),
         (["--trajectory", "1"], "trajectories 0 … 0"),
     ],
 )

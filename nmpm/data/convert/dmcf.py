@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from nmpm._support.bounded_files import EXPANSION, check_regular, expansion_limit
-from nmpm._support.messages import one_line
+from nmpm._support.messages import install, one_line
 from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options, located, readable
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.metadata import find_family
@@ -34,7 +34,7 @@ class Dmcf(FileFormat):
     """A file per trajectory; particle type 0 is the fluid, type 1 the solid boundary."""
 
     name: ClassVar[str] = "dmcf"
-    summary: ClassVar[str] = 'DMCF\'s *.msgpack.zst files (needs: pip install "nmpm[convert]")'
+    summary: ClassVar[str] = f"DMCF's *.msgpack.zst files (needs: {install('convert')})"
     pattern: ClassVar[str] = "*.msgpack.zst"
     family: ClassVar[str] = "lagrangebench"
     assumed: ClassVar[frozenset[str]] = frozenset({"dt", "gravity"})
@@ -73,7 +73,7 @@ def _frames(path: Path) -> Iterator[dict[str, Any]]:
         import msgpack
         import zstandard
     except ImportError as error:
-        raise ConfigError(f'{path}: reading it needs more packages: pip install "nmpm[convert]".') from error
+        raise ConfigError(f"{path}: reading it needs more packages: {install('convert')}.") from error
     check_regular(path)
     with (
         readable(path, "DMCF's frames", zstandard.ZstdError, msgpack.UnpackException, RecursionError),

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from nmpm._support.bounded_files import check_regular
+from nmpm._support.messages import install
 from nmpm.data.convert.base import readable
 from nmpm.data.convert.frame import Frame
 from nmpm.data.convert.frame_files import FrameFormat
@@ -24,7 +25,7 @@ class Ply(FrameFormat):
     """The element `vertex` of PLY files; a comment such as `time 0.5` states the time."""
 
     name: ClassVar[str] = "ply"
-    summary: ClassVar[str] = 'PLY files of points, a file per frame (needs: pip install "nmpm[vtk]")'
+    summary: ClassVar[str] = f"PLY files of points, a file per frame (needs: {install('vtk')})"
     patterns: ClassVar[tuple[str, ...]] = ("*.ply",)
 
     def frames(self, file: Path) -> Iterator[Frame]:
@@ -32,7 +33,7 @@ class Ply(FrameFormat):
         try:
             import plyfile
         except ImportError as error:
-            raise ConfigError(f'{file}: reading PLY needs plyfile: pip install "nmpm[vtk]".') from error
+            raise ConfigError(f"{file}: reading PLY needs plyfile: {install('vtk')}.") from error
         with readable(file, "PLY", plyfile.PlyParseError):
             content = plyfile.PlyData.read(str(file))
         yield _frame(content, file)

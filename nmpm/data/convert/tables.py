@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.bounded_files import check_regular
+from nmpm._support.messages import install
 from nmpm._support.progress import progress_bar
 from nmpm.data.convert.base import readable
 from nmpm.data.convert.text_lines import Lines, is_number, open_lines
@@ -148,7 +149,7 @@ def _open_parquet(path: Path) -> Iterator[Any]:
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
-        raise ConfigError(f'{path}: reading Parquet needs pyarrow: pip install "nmpm[tables]".') from error
+        raise ConfigError(f"{path}: reading Parquet needs pyarrow: {install('tables')}.") from error
     check_regular(path)
     with readable(path, "Parquet", pyarrow.ArrowException), pyarrow.parquet.ParquetFile(path) as file:
         yield file

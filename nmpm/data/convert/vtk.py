@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from nmpm._support.bounded_files import check_regular, expansion_limit, read_bounded
-from nmpm._support.messages import one_line
+from nmpm._support.messages import install, one_line
 from nmpm.data.convert.frame import Frame
 from nmpm.data.convert.frame_files import FrameFormat
 from nmpm.errors import ConfigError, DataError
@@ -27,7 +27,7 @@ class Vtk(FrameFormat):
     """A file per frame; or a `.pvd` that lists the files of a run."""
 
     name: ClassVar[str] = "vtk"
-    summary: ClassVar[str] = 'VTK\'s .vtk, .vtp, .vtu, a file per frame, or .pvd (needs: pip install "nmpm[vtk]")'
+    summary: ClassVar[str] = f"VTK's .vtk, .vtp, .vtu, a file per frame, or .pvd (needs: {install('vtk')})"
     patterns: ClassVar[tuple[str, ...]] = ("*.pvd", "*.vtp", "*.vtu", "*.vtk")
     listing: ClassVar[str] = "*.pvd"
 
@@ -55,7 +55,7 @@ def _read(path: Path, time: float | None) -> Frame:
         from vtkmodules.vtkIOLegacy import vtkGenericDataObjectReader
         from vtkmodules.vtkIOXML import vtkXMLGenericDataObjectReader
     except ImportError as error:
-        raise ConfigError(f'{path}: reading VTK needs pyvista: pip install "nmpm[vtk]".') from error
+        raise ConfigError(f"{path}: reading VTK needs pyvista: {install('vtk')}.") from error
     legacy = path.suffix.lower() == ".vtk"
     _check_size(path)
     reader = vtkGenericDataObjectReader() if legacy else vtkXMLGenericDataObjectReader()

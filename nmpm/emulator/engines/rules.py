@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import torch
 from torch import Tensor
 
+from nmpm._support.messages import install
 from nmpm.emulator.engines.engine import is_autocast
 from nmpm.emulator.engines.numba.parameters import DECODERS, NODES
 from nmpm.grid import Grid
@@ -105,7 +106,7 @@ RECORDINGS: tuple[Rule[Call], ...] = (
 RUNTIMES: tuple[Rule[Emulator], ...] = (
     Rule(
         "machines without OpenVINO", ("windows",), lambda _: importlib.util.find_spec("openvino") is None,
-        'pip install "nmpm[openvino]"',
+        install("openvino"),
     ),
     Rule(
         "models on other devices than a CPU", ("windows",), lambda model: model.device.type != "cpu",

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from nmpm._support.messages import one_line
+from nmpm._support.messages import install, one_line
 from nmpm.emulator.engines.rules import RUNTIMES, refusal
 from nmpm.emulator.runtimes.programs import Programs
 from nmpm.emulator.runtimes.runtime import Runtime, refuse_gradients
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from nmpm.emulator.model import Emulator
 
 _HINTS = {torch.float32: "f32", torch.bfloat16: "bf16"}
-_INSTALL = 'The runtime openvino needs a package that is not installed: pip install "nmpm[openvino]".'
+_INSTALL = f"The runtime openvino needs a package that is not installed: {install('openvino')}."
 
 
 class OpenVINO(Runtime):

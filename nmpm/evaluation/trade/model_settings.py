@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 
 from nmpm._support.devices import computes_bfloat16
+from nmpm._support.messages import install
 
 Precision = Literal["float32", "bfloat16"]
 EAGER, OPENVINO = "eager", "openvino"
@@ -51,5 +52,5 @@ class ModelSettings:
         if self.precisions(device) != self.precision:
             lines.append("bfloat16 is left out: this processor emulates it, which takes longer than float32.")
         if self.runtime is None and device.type == "cpu" and self.runtimes(device) == (EAGER,):
-            lines.append('OpenVINO, often the faster runtime, is left out: pip install "nmpm[openvino]" adds it.')
+            lines.append(f"OpenVINO, often the faster runtime, is left out: {install('openvino')} adds it.")
         return lines

@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.export import Dim, ExportedProgram
 
 from nmpm._support.atomic import atomic_write
+from nmpm._support.messages import install
 from nmpm._support.version import __version__
 from nmpm.errors import ConfigError
 from nmpm.transfer.execution import without_kernels
@@ -162,9 +163,7 @@ def _check_onnx() -> None:
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
-        raise ConfigError(
-            f'ONNX needs a package that is not installed: pip install "nmpm[export]" ({error}).'
-        ) from error
+        raise ConfigError(f"ONNX needs a package that is not installed: {install('export')} ({error}).") from error
 
 
 @contextmanager

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nmpm._support.messages import install
 from nmpm.data.convert import convert
 from nmpm.data.format import Split
 from nmpm.errors import ConfigError, DataError
@@ -73,5 +74,5 @@ def test_damaged_files_are_named(tmp_path, damage, message):
 def test_a_missing_library_gives_the_install_command(tmp_path, monkeypatch):
     write_run(tmp_path / "run")
     monkeypatch.setitem(sys.modules, "plyfile", None)
-    with pytest.raises(ConfigError, match=re.escape('reading PLY needs plyfile: pip install "nmpm[vtk]".')):
+    with pytest.raises(ConfigError, match=re.escape(f"reading PLY needs plyfile: {install('vtk')}.")):
         convert(tmp_path / "run", tmp_path / "out")

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nmpm._support.messages import install
 from nmpm.data.convert import convert
 from nmpm.data.format import Split, read_metadata
 from nmpm.errors import ConfigError, DataError
@@ -126,7 +127,7 @@ def test_wrong_lists(tmp_path, names, message):
 def test_a_missing_library_gives_the_install_command(tmp_path, monkeypatch):
     write_run(tmp_path / "run")
     monkeypatch.setitem(sys.modules, "vtkmodules.vtkIOXML", None)
-    with pytest.raises(ConfigError, match=re.escape('reading VTK needs pyvista: pip install "nmpm[vtk]".')):
+    with pytest.raises(ConfigError, match=re.escape(f"reading VTK needs pyvista: {install('vtk')}.")):
         convert(tmp_path / "run", tmp_path / "out")
 
 
