@@ -58,9 +58,7 @@ class SOAP(pytorch_optimizer.SOAP):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """As `pytorch_optimizer`'s, to the same bits."""
-        if not (self.defaults["record"] and all(map(_can_record, self.param_groups))):
-            return super().step(closure)
+        """As `pytorch_optimizer`'s, to rounding; weights of one shape are computed together."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -75,45 +73,134 @@ class SOAP(pytorch_optimizer.SOAP):
     def _move(self, number: int, group: dict[str, Any]) -> None:
         """Move the weights of a group, which is the optimizer's `number`-th."""
         weights = [weight for weight in group["params"] if weight.grad is not None]
-        states = [self.state[weight] for weight in weights]
-        moves = self._moves.get(number)
-        if moves is None or not moves.are_of(states):
-            moves = self._moves[number] = _RecordedMoves(weights, states, group)
+        states, gradients = [self.state[weight] for weight in weights], [weight.grad for weight in weights]
+        if self.defaults["record"] and _can_record(group):
+            recorded = self._moves.get(number)
+            if recorded is None or not recorded.are_of(states):
+                recorded = self._moves[number] = _RecordedMoves(weights, states, group)
+            moves = recorded(gradients)
+        else:
+            moves = _find_moves(gradients, states, group)
         step, (beta1, beta2) = group["step"] - 1, group["betas"]
         size = group["lr"] * (math.sqrt(self.debias(beta2, step)) / self.debias(beta1, step))
-        torch._foreach_add_(weights, moves([weight.grad for weight in weights]), alpha=size)
+        torch._foreach_add_(weights, moves, alpha=-size)
         torch._foreach_mul_(weights, 1.0 - group["weight_decay"] * group["lr"])
         if step % group["precondition_frequency"] == 0:
-            for state in states:
-                self._change_basis(state, group["max_precondition_dim"])
+            _change_bases(states)
 
-    def _change_basis(self, state: dict[str, Any], max_precondition_dim: int) -> None:
-        """Change the basis of a weight, in the memory that it has."""
-        squares = state["exp_avg_sq"]
-        changed = self.get_orthogonal_matrix_qr(state, max_precondition_dim)
-        state["exp_avg_sq"] = squares.copy_(state["exp_avg_sq"])
-        for basis, new in zip(state["Q"], changed, strict=True):
-            if len(basis):
-                basis.copy_(new)
+
+def _find_moves(
+    gradients: Sequence[Tensor], states: Sequence[dict[str, Any]], group: Mapping[str, Any]
+) -> list[Tensor]:
+    """How far weights move down at a learning rate of 1; updates the averages in their states."""
+    (beta1, beta2), moves = group["betas"], list(gradients)
+    means, squares = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq"))
+    torch._foreach_lerp_(means, moves, 1.0 - beta1)
+    for rows in _of_one_shape(gradients):
+        alike, shape = [states[row] for row in rows], gradients[rows[0]].shape
+        gradient, mean, square = (_stack([each[row] for row in rows]) for each in (gradients, means, squares))
+        bases = _stack_bases(alike, shape)
+        square.lerp_(_project(gradient, bases).square_(), 1.0 - beta2)
+        torch._foreach_copy_([squares[row] for row in rows], _unstack(square, shape))
+        move = _project(mean, bases).div_(square.sqrt_().add_(group["eps"]))
+        move = _project(move, [basis if basis is None else basis.mT for basis in bases])
+        for row, values in zip(rows, _unstack(move, shape), strict=True):
+            moves[row] = values
+        _average_products(gradient, alike, shape)
+    return moves
+
+
+def _of_one_shape(tensors: Sequence[Tensor]) -> list[list[int]]:
+    """Indices of tensors, those of each shape together."""
+    rows: dict[torch.Size, list[int]] = {}
+    for row, tensor in enumerate(tensors):
+        rows.setdefault(tensor.shape, []).append(row)
+    return list(rows.values())
+
+
+def _stack(weights: Sequence[Tensor]) -> Tensor:
+    """(n, K, O, I) of n weights (O, I, k_1, …) with a kernel of K cells; axes that weights lack have one element."""
+    shape = weights[0].shape
+    rows = torch.stack([weight.movedim((0, 1), (-2, -1)) if len(shape) > 2 else weight for weight in weights])
+    return rows.reshape(len(rows), math.prod(shape[2:]), *(shape[:1] or (1,)), *(shape[1:2] or (1,)))
+
+
+def _unstack(values: Tensor, shape: torch.Size) -> list[Tensor]:
+    """The n weights, of one shape, that `_stack` has made values of."""
+    if len(shape) < 3:
+        return list(values.reshape(len(values), *shape))
+    return list(values.reshape(len(values), *shape[2:], *shape[:2]).movedim((-2, -1), (1, 2)))
+
+
+def _stack_bases(states: Sequence[dict[str, Any]], shape: torch.Size) -> list[Tensor | None]:
+    """(n, d, d) bases of n weights of one shape along outputs, inputs and the kernel's cells; None for their own."""
+    axes = [torch.stack(axis) if len(axis[0]) else None for axis in zip(*(state["Q"] for state in states), strict=True)]
+    kernel = None
+    for basis, length in zip(axes[2:], shape[2:], strict=True):
+        if basis is None:
+            basis = torch.eye(length, device=states[0]["exp_avg"].device).expand(len(states), -1, -1)
+        kernel = basis if kernel is None else torch.einsum("nij,nkl->nikjl", kernel, basis).flatten(3).flatten(1, 2)
+    outputs, inputs = (*axes, None, None)[:2]
+    return [outputs, inputs, kernel]
+
+
+def _project(values: Tensor, bases: Sequence[Tensor | None]) -> Tensor:
+    """Values (n, K, O, I) of n weights in the bases of `_stack_bases`."""
+    outputs, inputs, kernel = bases
+    if inputs is not None:
+        values = (values.flatten(1, 2) @ inputs).view_as(values)
+    if outputs is not None:
+        values = outputs.mT.unsqueeze(1) @ values
+    return values if kernel is None else (kernel.mT @ values.flatten(2)).view_as(values)
+
+
+def _average_products(gradients: Tensor, states: Sequence[dict[str, Any]], shape: torch.Size) -> None:
+    """Add the gradients (n, K, O, I) of n weights of one shape to the averages of their products along each axis."""
+    kernel, letters = None, "abcdefg"[: len(shape[2:])]
+    for axis, averages in enumerate(zip(*(state["GG"] for state in states), strict=True)):
+        if not len(averages[0]):
+            continue
+        if axis == 0:
+            products = (gradients @ gradients.mT).sum(1)
+        elif axis == 1:
+            products = gradients.flatten(1, 2).mT @ gradients.flatten(1, 2)
+        else:
+            if kernel is None:
+                kernel = gradients.flatten(2) @ gradients.flatten(2).mT
+                kernel = kernel.unflatten(2, shape[2:]).unflatten(1, shape[2:])
+            this = letters[axis - 2]
+            products = torch.einsum(f"n{letters}{letters.replace(this, 'z')}->n{this}z", kernel)
+        torch._foreach_lerp_(averages, products.unbind(0), 1.0 - states[0]["shampoo_beta"])
+
+
+def _change_bases(states: Sequence[dict[str, Any]]) -> None:
+    """Turn weights' bases, in the memory that they have, by a power iteration and a QR decomposition."""
+    for rows in _of_one_shape([state["exp_avg_sq"] for state in states]):
+        alike = [states[row] for row in rows]
+        squares = torch.stack([state["exp_avg_sq"] for state in alike])
+        for axis, bases in enumerate(zip(*(state["Q"] for state in alike), strict=True)):
+            if not len(bases[0]):
+                continue
+            basis = torch.stack(bases)
+            products = torch.stack([state["GG"][axis] for state in alike]) @ basis
+            order = (basis * products).sum(1).argsort(dim=1, descending=True)
+            along = order.view(len(order), *(-1 if d == axis else 1 for d in range(squares.dim() - 1)))
+            squares = squares.gather(axis + 1, along.expand_as(squares))
+            turned = torch.linalg.qr(products.gather(2, order.unsqueeze(1).expand_as(products)))[0]
+            torch._foreach_copy_(bases, turned.unbind(0))
+        torch._foreach_copy_([state["exp_avg_sq"] for state in alike], squares.unbind(0))
 
 
 class _RecordedMoves:
-    """How weights move at a learning rate of 1, recorded for copies of their gradients.
+    """`_find_moves`, recorded for copies of gradients.
 
     Where recording fails, this is said once, and moves are computed operation by operation.
     """
 
     def __init__(self, weights: Sequence[Tensor], states: Sequence[dict[str, Any]], group: Mapping[str, Any]) -> None:
-        self._states = states
+        self._states, self._group = states, {"betas": group["betas"], "eps": group["eps"]}
         self._moves = [torch.zeros_like(weight) for weight in weights]
         self._gradients = [torch.zeros_like(move) for move in self._moves]
-        for move, gradient in zip(self._moves, self._gradients, strict=True):
-            move.grad = gradient
-        self._optimizer = pytorch_optimizer.SOAP(
-            self._moves, lr=1.0, betas=group["betas"], weight_decay=0.0, correct_bias=False, eps=group["eps"],
-            max_precondition_dim=group["max_precondition_dim"],
-        )  # fmt: skip
-        self._optimizer.state.update(zip(self._moves, states, strict=True))
         kept = [values for state in states for values in (state["exp_avg"], state["exp_avg_sq"], *state["GG"])]
         changing = [values for values in kept if len(values)]
         before = [values.clone() for values in changing]
@@ -136,9 +223,7 @@ class _RecordedMoves:
 
     @torch.no_grad()
     def _compute(self) -> None:
-        torch._foreach_zero_(self._moves)
-        self._optimizer.param_groups[0]["step"] = 1  # neither the first, nor one that changes the basis
-        self._optimizer.step()
+        torch._foreach_copy_(self._moves, _find_moves(self._gradients, self._states, self._group))
 
 
 def _can_record(group: Mapping[str, Any]) -> bool:

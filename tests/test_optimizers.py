@@ -4,6 +4,7 @@ import copy
 from functools import partial
 
 import pytest
+import pytorch_optimizer
 import torch
 
 from nmpm import optimizers
@@ -31,6 +32,32 @@ def test_it_finds_the_axes_along_which_a_problem_is_stretched():
     soap = loss_after(300, partial(SOAP, lr=0.03, weight_decay=0.0))
     adam = min(loss_after(300, partial(torch.optim.Adam, lr=rate)) for rate in (0.01, 0.03, 0.1))
     assert soap < 0.1 * adam
+
+
+@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
+def test_steps_are_those_of_the_plain_algorithm(device, layout):
+    """Weights of one shape are computed together, the axes of a kernel as one."""
+    generator = torch.Generator().manual_seed(0)
+    shapes = ((6, 5, 3, 2), (6, 5, 3, 2), (4,), (4,), (5, 7), (), (3, 9, 1, 1), (2, 3, 2, 2, 3))
+
+    def make(kind):
+        generator.manual_seed(1)
+        weights = [torch.nn.Parameter(torch.randn(shape, generator=generator).to(device)) for shape in shapes]
+        for weight in weights:
+            weight.data = weight.data.contiguous(memory_format=layout) if weight.dim() == 4 else weight.data
+        return weights, kind(weights, lr=0.01, weight_decay=0.1, max_precondition_dim=8, precondition_frequency=3)
+
+    (ours, together), (theirs, plain) = make(SOAP), make(pytorch_optimizer.SOAP)
+    for step in range(11):
+        for one, other in zip(ours, theirs, strict=True):
+            one.grad = torch.randn(one.shape, generator=generator).to(device)
+            one.grad, other.grad = torch.empty_like(one).copy_(one.grad), one.grad.clone()
+        if step == 6:
+            ours[2].grad = theirs[2].grad = None
+        together.step()
+        plain.step()
+    for one, other in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
 
 
 def test_complex_weights_are_refused_with_what_takes_them():
