@@ -4,15 +4,16 @@ nmpm demo dambreak2d --frames 400 --seed 1 --no-open --out dambreak2d
 nmpm demo waterramps --frames 400 --seed 1 --no-open --out waterramps
 python benchmarks/film.py docs/film.gif dambreak2d.h5 waterramps.h5
 
-Files are named after their models. The times are not those of the demonstrations, but the ones that `nmpm trade`
-measured on a machine that did nothing else: of the model as `Zoo.load` gives it, and of its data's simulator.
+Files are named after their models. The times are the ones that `nmpm trade` measured on a machine that did nothing else
+(CPU time): of the model as `Zoo.load` gives it, of the simulator as drawn, its shipped setting, and of the simulator at
+equal error, its cheapest stable setting whose full rollouts are no less accurate than the model's.
 """
 
 from __future__ import annotations
 
 import csv
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from timing import make_parser
 
 from nmpm._support.colours import BACKGROUND, FAINT_TEXT, OBSTACLE, TEXT, Rgb, material_colours
 from nmpm.data.format import Split
+from nmpm.evaluation.trade.ranking import Setting, at_equal_error
 from nmpm.viz.animation import _write_gif
 from nmpm.viz.files import read_labelled
 from nmpm.viz.panel import PanelRenderer
@@ -42,7 +44,8 @@ class Column:
         self.panel = PanelRenderer(trajectories, round(height * (right - left) / (top - bottom)))
         self.positions = tuple(trajectories.positions.values())
         self.name = file.stem
-        self.milliseconds = [_milliseconds(file.stem, kind) for kind in ("simulator", "model")]
+        shipped, equal, model = _milliseconds(file.stem)
+        self.times = (f"{shipped:.2g} ms per frame; {equal:.2g} at the model's error", f"{model:.2g} ms per frame")
 
     def draw(self, image: Image.Image, left: int, frame: int) -> None:
         """Draws the column with its texts, from this pixel on."""
@@ -52,7 +55,7 @@ class Column:
         for row, label in enumerate(("simulator", "model")):
             top = TITLE + HEADER + row * (HEADER + self.panel.height)
             draw.text((left, top - 7), label, TEXT, FONT, anchor="ls")
-            draw.text((right, top - 7), f"{self.milliseconds[row]:.2g} ms per frame", FAINT_TEXT, FONT, anchor="rs")
+            draw.text((right, top - 7), self.times[row], FAINT_TEXT, FONT, anchor="rs")
             image.paste(Image.fromarray(self.panel.draw(self.positions[row][frame])), (left, top))
 
 
@@ -93,10 +96,24 @@ def main() -> None:
     sys.stdout.write(f"wrote {options.out}: {options.out.stat().st_size / 1e6:.2f} MB\n")
 
 
-def _milliseconds(name: str, kind: str) -> float:
-    """Of a frame by the first of a kind in a table of `nmpm trade`."""
-    with (Path(__file__).parent / "trade" / name / "trade.csv").open(encoding="utf-8") as file:
-        return next(float(row["ms_per_frame"]) for row in csv.DictReader(file) if row["kind"] == kind)
+def read_trade(dataset: str) -> list[dict[str, str]]:
+    """The choices of a stored table of `nmpm trade`, with the MSE of their full rollouts as `value`."""
+    with (Path(__file__).parent / "trade" / dataset / "trade.csv").open(encoding="utf-8") as file:
+        return [row for row in csv.DictReader(file) if row["error"] == "mse"]
+
+
+def simulator_settings(rows: Sequence[Mapping[str, str]]) -> list[Setting]:
+    """The simulator's stable settings, the shipped one first."""
+    stable = [row for row in rows if row["kind"] == "simulator" and row["stable"] == "True"]
+    return [Setting(row["name"], float(row["ms_per_frame"]), float(row["value"])) for row in stable]
+
+
+def _milliseconds(name: str) -> tuple[float, float, float]:
+    """Of a frame by the simulator's shipped setting, by the one at equal error, and by the model."""
+    rows = read_trade(name)
+    settings, model = simulator_settings(rows), next(row for row in rows if row["kind"] == "model")
+    equal = at_equal_error(settings, float(model["value"])) or settings[0]
+    return settings[0].milliseconds, equal.milliseconds, float(model["ms_per_frame"])
 
 
 if __name__ == "__main__":

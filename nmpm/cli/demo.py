@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import dataclasses
 import os
 import sys
 import time
@@ -19,11 +21,14 @@ from nmpm.cli.options import (
     check_model,
     check_output,
 )
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, UnstableError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from nmpm.data.format import Trajectory
     from nmpm.emulator import Rollout
+    from nmpm.evaluation.trade.ranking import Setting
     from nmpm.particles import Window
     from nmpm.scene import Scene
     from nmpm.sim import Preset
@@ -52,10 +57,16 @@ def run(words: list[str]) -> None:
         check_output("--out", path)
     check_model(options.model)
     check_device(options.device)
+    from nmpm._support.devices import device_name
+    from nmpm._support.messages import counted
     from nmpm.cli.options import choose_threads
     from nmpm.cli.prediction import predicted, timed_rollout
     from nmpm.data.format import Split, write_split
     from nmpm.emulator.monitor import Monitor, Policy
+    from nmpm.evaluation.machine import clock_for
+    from nmpm.evaluation.prediction_errors import squared_errors
+    from nmpm.evaluation.trade.ranking import Setting
+    from nmpm.sim.predictability import twin_of
     from nmpm.viz.files import read_labelled
     from nmpm.viz.viewer import ViewerPage
     from nmpm.zoo import load_model
@@ -69,10 +80,22 @@ def run(words: list[str]) -> None:
             f" nmpm rollout {options.model} shows what it predicts; nmpm demo {DEFAULT} has a simulator."
         )
     choose_threads(model, 1)  # as many as the simulator's
+    sys.stdout.write(f"Scene of {preset.name}, seed {options.seed}; simulator: {preset.generator}.\n")
     simulated, slow = _simulate(preset, options.seed, options.frames + 1)
     window = scene_window(model, simulated)
-    rollout, fast = timed_rollout(model, window.initial, options.frames, Monitor(Policy.RECORD))
-    _print_times(slow, fast, options.device)
+    clock, read_clock = clock_for(model.emulator.device)
+    watch = Monitor(Policy.RECORD)
+    rollout, fast = timed_rollout(model, window.initial, options.frames, watch, clock=read_clock)
+    error = float(squared_errors(window, rollout.position).mean())
+    settings = [Setting("its shipped setting", slow, 0.0)]
+    for substeps in sorted({preset.stable_substeps, twin_of(preset).substeps}):
+        if substeps < preset.substeps:
+            fewer = dataclasses.replace(preset, substeps=substeps)
+            with contextlib.suppress(UnstableError):
+                again, taken = _simulate(fewer, options.seed, options.frames + 1)
+                off = float(squared_errors(window, scene_window(model, again).target).mean())
+                settings.append(Setting(f"{counted(substeps, 'substep')} instead of {preset.substeps}", taken, off))
+    _print_times(settings, error, fast, f"{clock} on {device_name(model.emulator.device, 1)}")
     _print_errors(model.scene, window, rollout)
     write_split(file, [predicted(model, options.model, model.scene, window.initial, rollout, window)])
     ViewerPage(read_labelled(Split(file))).write(page)
@@ -98,31 +121,45 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _simulate(preset: Preset, seed: int, frames: int) -> tuple[Trajectory, float]:
-    """The scene of a seed, and the simulator's milliseconds per frame."""
+    """The scene of a seed, and the simulator's milliseconds of CPU time per frame."""
     from nmpm._support.progress import progress_bar
     from nmpm.cli.prediction import milliseconds
     from nmpm.zoo.scenes import simulate_scene
 
-    sys.stdout.write(f"Scene of {preset.name}, seed {seed}; simulator: {preset.generator}.\n")
     sys.stdout.flush()
-    times = [time.perf_counter()]
-    with progress_bar("simulating", frames) as step:
+    times = [time.thread_time()]
+    with progress_bar(f"simulating, {preset.substeps} substeps a frame", frames) as step:
 
         def count(_: int) -> None:
-            times.append(time.perf_counter())
+            times.append(time.thread_time())
             step()
 
         simulated = simulate_scene(preset, seed, frames, progress=count)
     return simulated, milliseconds(times, 1)
 
 
-def _print_times(slow: float, fast: float, device: str) -> None:
-    from nmpm._support.devices import device_name, find_device
+def _print_times(settings: Sequence[Setting], error: float, fast: float, where: str) -> None:
+    """Print milliseconds per frame of the simulator's settings and of the emulator, and the speed-up at equal error.
 
-    cpu, here = device_name(find_device("cpu"), 1), device_name(find_device(device), 1)
+    Args:
+        settings: The shipped one, whose error is 0, first.
+        error: The emulator's.
+        fast: Milliseconds per frame of the emulator.
+        where: Its clock and device.
+    """
+    from nmpm._support.devices import device_name, find_device
+    from nmpm.evaluation.trade.ranking import at_equal_error
+
+    cpu = device_name(find_device("cpu"), 1)
+    for setting in settings:
+        sys.stdout.write(f"simulator: {setting.milliseconds:.3g} ms per frame, CPU time on {cpu}: {setting.name}\n")
+    sys.stdout.write(f"emulator:  {fast:.3g} ms per frame, {where}\n")
+    equal = at_equal_error(settings, error) or settings[0]
     sys.stdout.write(
-        f"simulator: {slow:.3g} ms per frame on {cpu}\n"
-        f"emulator:  {fast:.3g} ms per frame on {here}: {slow / fast:.3g} times as fast\n"
+        f"The emulator is {equal.milliseconds / fast:.3g} times as fast at equal error: as the simulator's cheapest of"
+        f" these settings that is no less accurate ({equal.name})"
+        + (f", {settings[0].milliseconds / fast:.3g} times as fast as its shipped setting" * (equal is not settings[0]))
+        + ".\n"
     )
 
 

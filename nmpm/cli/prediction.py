@@ -18,6 +18,7 @@ from nmpm.data.write import find_writer, write_trajectory
 from nmpm.emulator import Prescribed, Rollout, stream_rollout
 from nmpm.emulator.input_checks import warn_of_start_outside
 from nmpm.emulator.monitor import Monitor, Policy
+from nmpm.evaluation.machine import Clock
 from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.zoo import Pretrained
@@ -45,6 +46,7 @@ def timed_rollout(
     monitor: Monitor,
     prescribed: Prescribed | None = None,
     between: int = 1,
+    clock: Clock = time.perf_counter,
 ) -> tuple[Rollout, float]:
     """Predict so many frames, with a progress bar; with the milliseconds per frame.
 
@@ -55,10 +57,11 @@ def timed_rollout(
         monitor: Watches it.
         prescribed: What moves or enters as recorded.
         between: Frames that the model makes for each of these; all but every last of them are left out.
+        clock: That times it, in seconds.
     """
     start, given = on_device(model, state, prescribed)
     stream, times = stream_rollout(model.emulator, start, frames * between, monitor, given), list[float]()
-    parts = list(timed_parts(model, "rollout", stream, frames * between, between, times))
+    parts = list(timed_parts(model, "rollout", stream, frames * between, between, times, clock))
     return Rollout.join(parts), milliseconds(times, model.emulator.frames / between)
 
 
@@ -72,16 +75,22 @@ def on_device(
 
 
 def timed_parts(
-    model: Pretrained, what: str, stream: Iterable[Rollout], steps: int, between: int, times: list[float]
+    model: Pretrained,
+    what: str,
+    stream: Iterable[Rollout],
+    steps: int,
+    between: int,
+    times: list[float],
+    clock: Clock = time.perf_counter,
 ) -> Iterator[Rollout]:
     """The `kept_frames` of a rollout of so many steps, with a progress bar.
 
     Adds the time in seconds at the start, and after each bundle, to `times`.
     """
-    times.append(time.perf_counter())
+    times.append(clock())
     with progress_bar(what, -(-steps // model.emulator.frames)) as step:
         for part in kept_frames(stream, between):
-            times.append(time.perf_counter())
+            times.append(clock())
             yield part
             step()
 

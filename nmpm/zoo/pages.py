@@ -61,8 +61,6 @@ OPTIONAL = (
     *("failures", "weights", "license", "sha256"),
 )
 """Keys that a card may lack."""
-TRADE = "../benchmarks/trade/goop/trade.png"
-"""The picture of error and time, beside the zoo of a clone."""
 PLAIN = "eager float32"
 """Runtime and precision of a model as `Zoo.load` gives it."""
 COLUMNS = {"mse@100": "frames 1 – 100", "mse": "all frames"}
@@ -182,13 +180,11 @@ def index_page(root: Path, names: Sequence[str]) -> str:
                 cards[name] = card
         except (ZooError, DataError):
             continue
-    picture = TRADE if (root / TRADE).is_file() else None
     return _TEMPLATES.get_template("index.md").render(
         entries=entries,
         hardware=sorted({name for _, _, _, times, _ in entries for name in times}),
         speed_ups=speed_tables(cards),
         factor=f"{FACTOR:g}",
-        picture=picture,
         digits=lambda value: f"{value:.2g}",
     )
 

@@ -26,9 +26,13 @@ def test_a_scene_is_simulated_and_emulated_and_opened(monkeypatch, capsys):
     said = capsys.readouterr().out
     assert "Scene of goop, seed 1" in said
     times = [float(value) for value in re.findall(r"([\d.e+]+) ms per frame", said)]
-    assert len(times) == 2
+    assert len(times) == 4  # of the shipped setting, of two with fewer substeps, and of the emulator
     assert min(times) > 0
-    assert "times as fast" in said
+    assert len(re.findall("CPU time", said)) == 4
+    faster = float(re.search(r"([\d.]+) times as fast at equal error", said)[1])
+    named = re.search(r"no less accurate \((.+?)\)", said)[1]
+    row = re.search(rf"([\d.]+) ms per frame, CPU time on .*: {named}\n", said)
+    assert faster == pytest.approx(float(row[1]) / times[-1], rel=0.02)
     errors = re.search(r"emulator((?: +[\d.e+-]+)+)\n +nothing moves((?: +[\d.e+-]+)+)", said)
     emulator, still = (np.array(row.split(), dtype=float) for row in errors.groups())
     assert len(emulator) == len(still) == 3  # at frames 1, 10 and 20

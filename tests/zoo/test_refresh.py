@@ -1,5 +1,6 @@
 """Measures, READMEs and tables of entries; what others write meanwhile stays, incomplete cards are refused."""
 
+import csv
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -7,16 +8,18 @@ import pytest
 import yaml
 
 from nmpm._support.bounded_files import read_yaml
+from nmpm._support.digests import weights_digest
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.emulator import members
 from nmpm.errors import ConfigError, UnstableError, ZooError
 from nmpm.evaluation.stress import QUICK, results
+from nmpm.evaluation.trade.ranking import Setting, at_equal_error
 from nmpm.sim import load_preset
 from nmpm.sim.predictability import nudge, twin_of
 from nmpm.zoo import Zoo, load_model
 from nmpm.zoo import refresh as module
-from nmpm.zoo.card import lifecycle, stated_milliseconds
+from nmpm.zoo.card import lifecycle, preset_of, stated_milliseconds
 from nmpm.zoo.measures import simulator
 from nmpm.zoo.measures.simulator import NUDGE, floor_facts, twin_facts
 from nmpm.zoo.pages import entry_page, index_page
@@ -261,11 +264,28 @@ def test_the_page_of_the_shipped_zoo_is_made_of_its_cards():
     page = (SHIPPED / "README.md").read_text()
     assert page == index_page(SHIPPED, Zoo.list(SHIPPED))
     assert "| [goop](goop/README.md) | 1,713 particles, MPM | 0.69 | 0.33 – 0.14 | 2.1 – 4.9 |" in page
-    assert "(../benchmarks/trade/goop/trade.png)" in page
     first = (SHIPPED.parent / "README.md").read_text()
     assert "| [dambreak2d](zoo/dambreak2d/README.md) | 5,000 particles, SPH | 52 | 1.4 – 0.90 | 37 – 57 |" in first
     assert replace_table(first, {name: Zoo.card(name, SHIPPED) for name in Zoo.list(SHIPPED)}, "zoo/") == first
     assert len([word for line in page.splitlines() if not line.startswith("|") for word in line.split()]) < 400
+
+
+@pytest.mark.parametrize("name", [name for name in Zoo.list(SHIPPED) if "trade" in Zoo.card(name, SHIPPED)])
+def test_speed_ups_of_cards_are_those_of_the_stored_trade_at_equal_error(name):
+    card = Zoo.card(name, SHIPPED)
+    with (SHIPPED.parent / "benchmarks" / "trade" / preset_of(card) / "trade.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["error"] == "mse" and row["stable"] == "True"]
+    stable = [row for row in rows if row["kind"] == "simulator"]
+    settings = [Setting(row["name"], float(row["ms_per_frame"]), float(row["value"])) for row in stable]
+    forms = [row for row in rows if row["model"] == name and row["constraints"] == "held" and row["batch"] == "1"]
+    assert {row["clock"] for row in [*stable, *forms]} == {"CPU time"}
+    assert {row["weights"] for row in forms} == {weights_digest(Zoo.load(name, SHIPPED).emulator.state_dict())[:12]}
+    times = {f"{row['runtime']} {row['precision']}": float(row["ms_per_frame"]) for row in forms}
+    assert {time["runtime"]: time["ms_per_frame"] for time in card["trade"]["times"]} == times
+    fastest = min(forms, key=lambda row: float(row["ms_per_frame"]))
+    setting = at_equal_error(settings, float(fastest["value"]))
+    assert f"simulator, {card['trade']['simulator']}" == setting.name
+    assert card["trade"]["speed_up"] == pytest.approx(setting.milliseconds / min(times.values()), rel=2e-3)
 
 
 @pytest.mark.parametrize(

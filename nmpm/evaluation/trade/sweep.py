@@ -62,14 +62,14 @@ class SimulatorSettings:
     """Settings of the simulator, beside the shipped one and its twin, see `nmpm.sim.predictability`.
 
     Args:
-        coarser: Factors on the width of cells (SPH: on the spacing of particles); 1 is as shipped.
+        coarser: Further factors on the width of cells (SPH: on the spacing of particles), beside 1.
         substeps: Shares of the shipped number of substeps, which a coarser simulation divides by its factor. Those that
-            turn out unstable are reported as such; `Preset.stable_substeps` is measured too.
+            turn out unstable are reported as such; `Preset.stable_substeps` and the twin's are measured too.
         nudge: Noise on the initial positions, as a share of the domain's longest side, that shows how sensitive the
             scenes are; 0 for none.
     """
 
-    coarser: tuple[int, ...] = (1, 2, 4)
+    coarser: tuple[int, ...] = (2, 4)
     substeps: tuple[float, ...] = (1.0, 0.75, 0.5, 0.35, 0.25)
     nudge: float = 1e-6
 
@@ -181,20 +181,23 @@ def make_choices(
 def _simulator_choices(settings: SimulatorSettings, preset: Preset) -> Iterator[Choice]:
     """The simulator as shipped, other settings but for those that the preset itself refuses, and the floors."""
     yield _simulator_choice(preset, 1)
-    for factor in settings.coarser:
+    twin = twin_of(preset)
+    for factor in sorted({1, *settings.coarser}):
         try:
             coarse = preset.coarsened(factor) if factor > 1 else preset
         except ConfigError:
             continue
         counts = {math.ceil(share * preset.substeps / factor) for share in settings.substeps}
-        for substeps in sorted(counts | {coarse.stable_substeps}, reverse=True):
+        counts |= (
+            {coarse.stable_substeps} if factor > 1 else {coarse.stable_substeps, min(twin.substeps, preset.substeps)}
+        )
+        for substeps in sorted(counts, reverse=True):
             if (factor, substeps) == (1, preset.substeps):
                 continue
             try:
                 yield _simulator_choice(dataclasses.replace(coarse, substeps=substeps), factor)
             except ConfigError:  # a wave would skip cells or particles
                 continue
-    twin = twin_of(preset)
     yield _simulator_choice(twin, 1, f"twin: {twin.substeps} of {preset.substeps} substeps")
     if settings.nudge:
         yield _simulator_choice(preset, 1, f"simulator nudged by {settings.nudge:g}", settings.nudge)

@@ -5,7 +5,15 @@ import pytest
 
 from nmpm.evaluation.bootstrap import intervals, resampled_means
 from nmpm.evaluation.trade import Kind
-from nmpm.evaluation.trade.ranking import beside_simulator, pareto_members, pareto_probabilities, rank, recommend
+from nmpm.evaluation.trade.ranking import (
+    Setting,
+    at_equal_error,
+    beside_simulator,
+    pareto_members,
+    pareto_probabilities,
+    rank,
+    recommend,
+)
 from tests.evaluation.trade.made_up import point
 
 POINTS = [
@@ -71,10 +79,18 @@ def test_the_simulator_at_equal_time_and_at_equal_error():
     sentence = beside_simulator(POINTS)
     assert "ours, beside the simulator: no stable simulator setting is as fast" in sentence
     assert "simulator, 6 substeps is no less accurate and takes 2 × its time" in sentence
+    assert "(the shipped setting, simulator, 12 substeps, 4 ×)" in sentence
     slower = beside_simulator([one for one in POINTS if one.name != "ours"])
     assert "simulator, 6 substeps is no slower and has 0.5 × its error" in slower
     assert beside_simulator([one for one in POINTS if one.kind is not Kind.SIMULATOR]) == ""
     assert beside_simulator([]) == ""
+
+
+def test_the_setting_at_equal_error_is_the_cheapest_that_is_no_less_accurate():
+    shipped, half, coarse = Setting("shipped", 4.0, 0.0), Setting("half", 2.0, 1.0), Setting("coarse", 0.5, 3.0)
+    for error, expected in ((0.0, shipped), (0.9, shipped), (1.0, half), (2.9, half), (3.0, coarse)):
+        assert at_equal_error([half, shipped, coarse], error) == expected
+    assert at_equal_error([half], 0.5) is None
 
 
 def test_the_fastest_of_equally_accurate_emulators_stands_beside_the_simulator():

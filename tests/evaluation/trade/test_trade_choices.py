@@ -84,6 +84,10 @@ def test_repeated_and_refused_settings_are_left_out_and_recorded_scenes_have_no_
     strict = make_choices(tiny_sweep(), dataclasses.replace(scenes, preset=least), {})
     assert strict[0].name == f"simulator, {least.substeps} substeps"
     assert f"twin: {2 * least.substeps} of {least.substeps} substeps" in [choice.name for choice in strict]
+    compared = make_choices(read_sweep(shipped_sweep_text("compare"), "compare.yaml"), scenes, {})
+    twin = next(choice for choice in compared if choice.name.startswith("twin"))
+    same = next(choice for choice in compared if choice.kind is Kind.SIMULATOR and choice.identity == twin.identity)
+    assert same.name == "simulator, 3 substeps"  # the twin is a setting like others
     recorded = dataclasses.replace(scenes, preset=None, seeds=())
     kinds = {choice.kind for choice in make_choices(tiny_sweep(), recorded, {"one": tiny_emulator(scenes.scene)})}
     assert kinds == {Kind.MODEL, Kind.TRIVIAL}
