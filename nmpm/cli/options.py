@@ -215,6 +215,9 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
         help="of measured tracks: replace positions by local quadratic fits to so many frames, e.g. 5; errors are then"
         " against the smoothed tracks",
     )
+    group.add_argument(
+        "--files", metavar="PATTERN,...", help="names of the files to read, e.g. 'Fluid_*.vtk', where others lie beside"
+    )
     group.add_argument("--fields", metavar="NAME,...", help="fields that are inputs of models, e.g. temperature")
 
 
@@ -237,6 +240,7 @@ def data_options(options: argparse.Namespace) -> Options:
         fields=parse_option("--fields", options.fields, _field_names, "names, e.g. temperature,stiffness"),
         resample=options.resample,
         smooth=options.smooth,
+        files=options.files,
     )
 
 

@@ -74,6 +74,7 @@ class TrajectoryDataModule(LightningDataModule):
         resample: Time between frames that the positions of recorded data are interpolated to, where theirs are uneven.
         smooth: Frames of local quadratic fits that replace measured positions, such as 5, against their noise; errors
             are then against the smoothed tracks.
+        files: Patterns of the names of the files to read, separated by commas, where others lie beside them.
         limit_eval: Validate on the first `limit_eval` trajectories only.
         eval_batch_size: Trajectories per evaluation batch, of equal length each.
         generate: Options for the simulation of `name`: `counts` (trajectories per split), `frames`, `seed`, `workers`.
@@ -108,6 +109,7 @@ class TrajectoryDataModule(LightningDataModule):
         prescribed: list[int] | None = None,
         resample: float | None = None,
         smooth: int | None = None,
+        files: str | None = None,
         limit_eval: int | None = None,
         eval_batch_size: int = 8,
         generate: dict[str, Any] | None = None,
@@ -123,6 +125,7 @@ class TrajectoryDataModule(LightningDataModule):
             fields=fields,
             resample=resample,
             smooth=smooth,
+            files=files,
         )
         self.data_source = make_source(path, name, source, options, generate)
         if reading is not None:

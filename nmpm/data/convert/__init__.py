@@ -24,6 +24,7 @@ from nmpm.data.convert.conversion import renumber_types, write_native
 from nmpm.data.convert.csv_frames import CsvFrames
 from nmpm.data.convert.deepmind import DeepMind
 from nmpm.data.convert.dmcf import Dmcf
+from nmpm.data.convert.frame_files import FrameFormat
 from nmpm.data.convert.gns_npz import GnsNpz
 from nmpm.data.convert.lammps import Lammps
 from nmpm.data.convert.native import Native, NativeFiles
@@ -73,17 +74,18 @@ def open_dataset(path: Path, format_name: str | None = None, options: Options | 
     """
     options = options or Options()
     as_stored = replace(options, resample=None, smooth=None)
-    dataset = _find_format(Path(path), format_name).open(Path(path), as_stored)
+    dataset = _find_format(Path(path), format_name, options.files).open(Path(path), as_stored)
     return retime(replace(dataset, unknown=dataset.unknown - as_stored.stated), options)
 
 
-def _find_format(path: Path, name: str | None) -> DatasetFormat:
-    """The format of that name, or else the first that recognises the path."""
+def _find_format(path: Path, name: str | None, files: str | None = None) -> DatasetFormat:
+    """The format of that name, or else the first that recognises the path; for those files alone that are selected."""
+    formats = FORMATS if files is None else tuple(kind.select(files) for kind in FORMATS if kind.patterns)
     names = ", ".join(kind.name for kind in FORMATS)
     if name is not None:
-        for kind in FORMATS:
+        for kind in formats:
             if kind.name == name:
-                return kind
+                return kind if kind.patterns == () or kind.recognises(path) else kind.with_any_name()
         raise ConfigError(f"No format is called {name!r}; known: {names}.")
     if not path.exists():
         raise DataError(f"{path}: no such file or folder.")
@@ -91,10 +93,17 @@ def _find_format(path: Path, name: str | None) -> DatasetFormat:
         raise DataError(f"{path}: the file is empty. Copy, download or write it again.")
     inner = list(islice(subfolders(path), _MOST_INNER))
     if sum(map(has_splits, inner)) < 2:
-        for kind in FORMATS:
+        for kind in formats:
             with suppress(NmpmError, OSError):
                 if kind.recognises(path):
                     return kind
+        for kind in formats:
+            by_content = kind.with_any_name()
+            with suppress(NmpmError, OSError):
+                if isinstance(kind, FrameFormat) and kind.signature and by_content.recognises(path):
+                    return by_content
+    if files is not None:
+        raise DataError(f"{path}: --files {files}: no file of these names is of a format that is read.")
     datasets = [folder for folder in inner if _is_dataset(folder)]
     raise DataError(describe_several(path, datasets) if datasets else describe_unknown(path))
 

@@ -34,7 +34,7 @@ class ArrayFiles(RunFiles):
 
     name: ClassVar[str] = "arrays"
     summary: ClassVar[str] = "positions (T, N, D) or (R, T, N, D) in .npz, .npy, .h5, .hdf5, by usual names"
-    patterns: ClassVar[tuple[str, ...]] = ("*.npz", "*.npy", "*.h5", "*.hdf5")
+    patterns: tuple[str, ...] = ("*.npz", "*.npy", "*.h5", "*.hdf5")
 
     def recognises(self, path: Path) -> bool:
         first = next(iter(self.files(path).values()), ())

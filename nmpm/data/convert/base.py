@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import abc
+import copy
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from pathlib import Path
-from typing import Any, ClassVar, get_args
+from pathlib import Path, PurePosixPath
+from typing import Any, ClassVar, Self, get_args
 
 from nmpm._support.messages import one_line, suggestion
 from nmpm.data.format import Metadata, Trajectory
@@ -21,6 +22,9 @@ from nmpm.scene import Boundary, Interval, check_field_names
 
 UNKNOWN_LENGTH = 0
 """`Metadata.sequence_length` where the files do not state it; the conversion sets the length that it finds."""
+
+ANY_NAME = ("*",)
+"""Patterns of a reader that goes by the content of files."""
 
 _SETTLED = ("bounds", "dt", "gravity", "boundary")
 
@@ -44,6 +48,7 @@ class Options:
     fields: Sequence[str] | None = None  # names of the fields that are inputs of models
     resample: float | None = None  # time between frames that positions are interpolated to
     smooth: int | None = None  # frames of the local quadratic fit that replaces positions
+    files: str | None = None  # patterns of the names of the files to read, such as "Part{Fluid,Bound}_*"
 
     def __post_init__(self) -> None:
         if self.boundary is not None and not set(self.boundary) <= set(get_args(Boundary)):
@@ -62,7 +67,7 @@ class Options:
     @property
     def of_converted(self) -> Options:
         """The same for data that are resampled and smoothed already."""
-        return replace(self, dt=self.resample or self.dt, resample=None, smooth=None)
+        return replace(self, dt=self.resample or self.dt, resample=None, smooth=None, files=None)
 
     @property
     def stated(self) -> frozenset[str]:
@@ -138,10 +143,26 @@ class DatasetFormat(abc.ABC):
     Attributes:
         name: The format's name.
         summary: One line for the command line's help.
+        patterns: Of the files' names; none where names are fixed.
+        selected: Further patterns, which the user states.
     """
 
     name: ClassVar[str]
     summary: ClassVar[str]
+    patterns: tuple[str, ...] = ()
+    selected: tuple[str, ...] = ()
+
+    def select(self, files: str) -> Self:
+        """The same reader of those files alone whose names fit one of these patterns, separated by commas."""
+        selecting = copy.copy(self)
+        selecting.selected = tuple(pattern.strip() for pattern in files.split(","))
+        return selecting
+
+    def with_any_name(self) -> Self:
+        """The same reader of files with any names."""
+        reader = copy.copy(self)
+        reader.patterns = ANY_NAME
+        return reader
 
     @abc.abstractmethod
     def recognises(self, path: Path) -> bool:
@@ -229,6 +250,12 @@ def located(where: Path | str) -> Iterator[None]:
         yield
     except DataError as error:
         raise DataError(f"{where}: {error}") from error
+
+
+def is_selected(file: Path, patterns: Sequence[str]) -> bool:
+    """Whether the end of a file's path fits one of the patterns, in lower or upper case; of none any does."""
+    lower = PurePosixPath(file.as_posix().lower())
+    return not patterns or any(lower.match(pattern.lower()) for pattern in patterns)
 
 
 def split_files(path: Path, *patterns: str, unsplit: str = "test") -> dict[str, tuple[Path, ...]]:

@@ -22,7 +22,7 @@ class CsvFrames(FrameFormat):
 
     name: ClassVar[str] = "csv-frames"
     summary: ClassVar[str] = "tables with a file per frame (.csv, .tsv, also .gz; .parquet): x, y, z"
-    patterns: ClassVar[tuple[str, ...]] = ("*.csv", "*.csv.gz", "*.tsv", "*.tsv.gz", "*.parquet")
+    patterns: tuple[str, ...] = ("*.csv", "*.csv.gz", "*.tsv", "*.tsv.gz", "*.parquet")
 
     def recognises(self, path: Path) -> bool:
         files = next(self._folders(path), (path, []))[1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -26,6 +26,8 @@ ARRAY_NAMES = frozenset(
     }
 )
 """Names of arrays with a meaning, in lower case without separators."""
+ID_STRIDE = 2**32
+"""Between the ids of the parts of a frame."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,49 @@ class Frame:
     box: tuple[Interval, ...] | None = None  # (lower, upper) per axis, of the simulator
     boundary: tuple[Boundary, ...] | None = None  # of the box, per axis
     left_out: tuple[str, ...] = ()  # names of what else is in the file
+    surface: bool = False  # whether its points are corners of lines or faces
+
+
+def join_frames(parts: Sequence[tuple[str, Frame]]) -> Frame:
+    """The particles of several frames, with their materials' names as types; arrays that not all have are left out.
+
+    Ids of the first part stay; those of the others, which may be the same numbers, are counted from `ID_STRIDE` on.
+    """
+    first = parts[0][1]
+    names = [
+        name for name in first.arrays if all(_fits(first.arrays[name], frame.arrays.get(name)) for _, frame in parts)
+    ]
+    types = with_meaning("types", names)
+    arrays = {
+        f"{name}_in_file" if name in types else name: np.concatenate([frame.arrays[name] for _, frame in parts])
+        for name in names
+    }
+    for name in with_meaning("id", arrays):
+        if arrays[name].dtype.kind in "iuf":
+            starts = np.repeat(np.arange(len(parts)) * ID_STRIDE, [len(frame.position) for _, frame in parts])
+            arrays[name] = arrays[name].astype(np.int64) + starts
+    return replace(
+        first,
+        position=np.concatenate([frame.position for _, frame in parts]),
+        arrays=arrays
+        | {"material": np.repeat([name for name, _ in parts], [len(frame.position) for _, frame in parts])},
+        left_out=tuple(
+            dict.fromkeys(
+                [
+                    *(name for _, frame in parts for name in frame.left_out),
+                    *(name for _, frame in parts for name in frame.arrays if name not in names),
+                ]
+            )
+        ),
+    )
+
+
+def _fits(values: np.ndarray, other: np.ndarray | None) -> bool:
+    return (
+        other is not None
+        and other.shape[1:] == values.shape[1:]
+        and (other.dtype.kind == "U") == (values.dtype.kind == "U")
+    )
 
 
 def flat_axes(frames: Sequence[Frame]) -> dict[int, float]:
@@ -76,7 +121,7 @@ class Layout:
         notes = [f"{AXES[axis]} is {value:g} everywhere: 2-D data, of {kept}." for axis, value in self.constant.items()]
         notes += [f"Particles are matched by the array {self.id_name!r}."] if self.id_name else []
         left_out = ", ".join(self.left_out)
-        return (*notes, *([f"Left out, as they are not numbers of particles: {left_out}."] if left_out else []))
+        return (*notes, *([f"Left out, as they are not numbers of all particles: {left_out}."] if left_out else []))
 
 
 def wrap(position: np.ndarray, box: Sequence[Interval] | None, boundary: Sequence[Boundary] | None) -> np.ndarray:

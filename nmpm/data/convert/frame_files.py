@@ -16,8 +16,8 @@ import abc
 import fnmatch
 import os
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice, repeat
 from pathlib import Path
@@ -28,15 +28,28 @@ import numpy as np
 from nmpm._support.messages import counted
 from nmpm._support.progress import progress_bar
 from nmpm.data.convert.base import (
+    ANY_NAME,
     DatasetFormat,
     ForeignDataset,
     Options,
     find_split_name,
+    is_selected,
     number_order,
 )
-from nmpm.data.convert.frame import Frame, Layout, ParticleArrays, flat_axes
+from nmpm.data.convert.file_kinds import (
+    NUMBER,
+    Kinds,
+    by_kind,
+    choose_particles,
+    is_other_folder,
+    keep_particles,
+    material_names,
+    stem,
+)
+from nmpm.data.convert.frame import Frame, Layout, ParticleArrays, flat_axes, join_frames
 from nmpm.data.convert.frame_stack import FrameStack
 from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, open_divided, placeholder_metadata
+from nmpm.data.convert.text_lines import starts_with
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.split_files import SPLITS
 from nmpm.errors import DataError
@@ -44,7 +57,6 @@ from nmpm.errors import DataError
 _DEPTH = 3  # of folders
 _FIRST_FRAMES = 10  # of a file with many, from which the layout is taken
 _MISSING = 0.1  # part of a run's frames that may be missing
-_NUMBER = re.compile(r"\d{1,18}(?!.*\d)")
 
 
 @dataclass(frozen=True)
@@ -52,6 +64,8 @@ class FrameRun(Run):
     """A run in a file with many frames, or in a file per frame (None where one is missing)."""
 
     files: tuple[Path | None, ...] = ()
+    material: str = ""  # of the particles, where files of further materials belong to these
+    beside: Mapping[Path, Sequence[tuple[str, Path]]] = field(default_factory=dict)  # these, with their materials
 
     @property
     def present(self) -> tuple[Path, ...]:
@@ -63,12 +77,12 @@ class FrameFormat(DatasetFormat):
     """Abstract reader of a format whose files contain one frame, or many, one subclass per format.
 
     Attributes:
-        patterns: Of the files' names.
         listing: Of the names of files that list the frames of a run; where there is one, others are only read by it.
+        signature: Bytes that files begin with, by which they are recognised where their names have no usual suffix.
     """
 
-    patterns: ClassVar[tuple[str, ...]]
     listing: ClassVar[str] = ""
+    signature: ClassVar[bytes] = b""
 
     @abc.abstractmethod
     def frames(self, file: Path) -> Iterator[Frame]:
@@ -103,8 +117,8 @@ class FrameFormat(DatasetFormat):
     def _folders(self, path: Path) -> Iterator[tuple[Path, list[Path]]]:
         """Yields folders with files of this format and these files; of a file its own."""
         if path.is_file():
-            if self._matching([path.name]):
-                yield path.parent, [path]
+            if files := self._matching(path.parent, [path.name]):
+                yield path.parent, files
             return
         for folder, inner, names in os.walk(path):
             lists = fnmatch.filter(names, self.listing)
@@ -112,32 +126,61 @@ class FrameFormat(DatasetFormat):
             inner[:] = [name for name in inner if not name.startswith(".") and not lists]
             if len(Path(folder).relative_to(path).parts) >= _DEPTH:
                 inner.clear()
-            if files := [Path(folder, name) for name in lists or self._matching(names)]:
+            if files := self._matching(Path(folder), lists or names):
                 yield Path(folder), sorted(files, key=number_order)
 
-    def _matching(self, names: Sequence[str]) -> list[str]:
-        return [name for name in names if any(fnmatch.fnmatch(name.lower(), pattern) for pattern in self.patterns)]
+    def _matching(self, folder: Path, names: Sequence[str]) -> list[Path]:
+        """The files of this format among those of a folder."""
+        named = [name for name in names if any(fnmatch.fnmatch(name.lower(), pattern) for pattern in self.patterns)]
+        files = [folder / name for name in named if is_selected(folder / name, self.selected)]
+        by_content = self.signature and self.patterns == ANY_NAME
+        return [file for file in files if starts_with(file, self.signature)] if by_content else files
 
     def _runs(self, path: Path) -> tuple[list[FrameRun], list[str]]:
         """The runs in order, and notes on missing frames."""
         folders = list(self._folders(path))
         if not folders:
-            raise DataError(f"{path}: no file {' or '.join(self.patterns)} there.")
+            raise DataError(f"{path}: no file {' or '.join(self.selected or self.patterns)} there.")
+        others = [folder for folder, _ in folders if folder != path and is_other_folder(folder)]
+        if others and len(others) < len(folders) and not self.selected:
+            folders = [(folder, files) for folder, files in folders if folder not in others]
         many = len(list(islice(self.frames(folders[0][1][0]), 2))) > 1
         if path.is_file() and not many:
             raise DataError(f"{path}: there is one frame in it. Give the folder of the frames.")
         runs: list[FrameRun] = []
-        gaps: list[str] = []
+        gaps, choices = list[str](), list[str]()
         for folder, files in folders:
+            kinds, choice = self._choose(folder, files, many)
+            choices += [choice] if choice else []
             if many:
-                runs += [FrameRun(file, 0, split=_split_of(file, path), files=(file,)) for file in files]
+                runs += [
+                    FrameRun(file, 0, split=_split_of(file, path), files=(file,))
+                    for each in kinds.values()
+                    for file in each
+                ]
             else:
-                series = _series(folder, files, gaps)
-                runs.append(FrameRun(folder, 0, len(series), _split_of(folder, path), files=series))
+                runs.append(_run_of(kinds, folder, _split_of(folder, path), gaps))
         if many and len(runs) < 3:
             runs = [replace(run, frames=self.count(run.file)) for run in runs]
-        rest = f" The same in {counted(len(gaps) - 1, 'more run')}." if gaps[1:] else ""
-        return runs, [f"{gap}{rest}" for gap in gaps[:1]]
+        left_out = (
+            f"{others[0]}: left out by its name, with {counted(len(others) - 1, 'more folder')}." if others else ""
+        )
+        return runs, [*filter(None, (_first_of(gaps), _first_of(choices), left_out))]
+
+    def _choose(self, folder: Path, files: Sequence[Path], many: bool) -> tuple[Kinds, str]:
+        """The files of particles among those of a folder, by their names, and a note on the others."""
+        kinds = by_kind(files)
+        if len(kinds) == 1 or self.selected:
+            return kinds, ""
+        return keep_particles(folder, kinds) if many else choose_particles(folder, kinds, self._problem)
+
+    def _problem(self, file: Path) -> str:
+        """Why a file has no particles; empty if it has."""
+        try:
+            frame = next(self.frames(file), None)
+        except DataError as error:
+            return str(error).removeprefix(f"{file}: ").rstrip(".")
+        return "no frame" if frame is None else "a surface" if frame.surface else ""
 
     def _first_frames(self, run: FrameRun) -> list[Frame]:
         """A few frames of a run with particles: the first of a file with many, else those of a few files."""
@@ -165,8 +208,9 @@ class FrameFormat(DatasetFormat):
 
         named = ids(first[0])
         if named:
-            others = (frame for run in runs for frame in islice(self.frames(run.present[0]), 1))
-            named = {name: number for frame in (*others, *first) for name, number in ids(frame).items()}
+            firsts = (frame for run in runs for frame, _ in islice(self._frames_of(replace(run, files=run.present)), 1))
+            frames = [*filter(None, firsts), *first]
+            named = {name: number for frame in frames for name, number in ids(frame).items()}
         if set(named.values()) == {-1}:
             return {name: number for number, name in enumerate(sorted(named))}
         return named if len(set(named.values())) == len(named) else {}
@@ -204,24 +248,38 @@ class FrameFormat(DatasetFormat):
         if len(frames) != 1:
             number = "more than one frame" if frames else "no frame"
             raise DataError(f"{file}: there is {number} in it, but one in the first file.")
-        return frames[0]
+        beside = [(name, next(self.frames(other))) for name, other in run.beside.get(file, ())]
+        return join_frames([(run.material, frames[0]), *beside]) if beside else frames[0]
+
+
+def _run_of(kinds: Kinds, folder: Path, split: str | None, gaps: list[str]) -> FrameRun:
+    """The run in a folder whose particles are in files of these kinds; those of the first tell the frames."""
+    names, (first, *others) = material_names(kinds), kinds
+    series = _series(folder, kinds[first], gaps)
+    numbers = {other: np.array([_number(file) for file in kinds[other]]) for other in others}
+    beside = {
+        file: [
+            (names[other], kinds[other][max(0, int(np.searchsorted(numbers[other], _number(file), side="right")) - 1)])
+            for other in others
+        ]
+        for file in kinds[first]
+    }
+    return FrameRun(folder, 0, len(series), split, files=series, material=names[first], beside=beside)
+
+
+def _first_of(notes: Sequence[str]) -> str:
+    """The first note, and the number of others like it."""
+    return f"{notes[0]} The same in {counted(len(notes) - 1, 'more run')}." if notes[1:] else "".join(notes)
+
+
+def _number(file: Path) -> int:
+    match = NUMBER.search(stem(file))
+    return int(match.group()) if match else 0
 
 
 def _series(folder: Path, files: Sequence[Path], gaps: list[str]) -> tuple[Path | None, ...]:
-    """The files of a folder in the order of their numbers, None where one is missing; adds a note on such gaps.
-
-    Raises:
-        DataError: if the names differ in more than their last number.
-    """
-    names = [_NUMBER.sub("*", _stem(file)) + file.suffix for file in files]
-    if len(set(names)) > 1:
-        kinds = ", ".join(f"{name} ({names.count(name)})" for name in list(dict.fromkeys(names))[:4])
-        raise DataError(
-            f"{folder}: files of {len(set(names))} kinds: {kinds}. Their names should differ in their last number only,"
-            " that of the frame: give each run a folder of its own, and remove other files."
-        )
-    matches = [_NUMBER.search(_stem(file)) for file in files]
-    numbers = np.array([int(match.group()) if match else 0 for match in matches])
+    """The files of a folder in the order of their numbers, None where one is missing; adds a note on such gaps."""
+    numbers = np.array([_number(file) for file in files])
     steps = np.diff(numbers)
     if len(files) < 3 or (steps == steps[0]).all():
         return tuple(files)
@@ -239,11 +297,6 @@ def _series(folder: Path, files: Sequence[Path], gaps: list[str]) -> tuple[Path 
     )
     present = dict(zip(indices.tolist(), files, strict=True))
     return tuple(present.get(index) for index in range(len(files) + missing))
-
-
-def _stem(file: Path) -> str:
-    """The name without its suffixes: `vtk`, `lammpstrj.gz`."""
-    return re.sub(r"(\.[A-Za-z]\w*){1,2}$", "", file.name)
 
 
 def _split_of(file: Path, path: Path) -> str | None:

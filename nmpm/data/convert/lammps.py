@@ -46,8 +46,9 @@ class Lammps(FrameFormat):
     """LAMMPS text dumps; particles are sorted by id."""
 
     name: ClassVar[str] = "lammps"
-    summary: ClassVar[str] = "LAMMPS text dumps (.lammpstrj, .dump, dump.*), also gzipped"
-    patterns: ClassVar[tuple[str, ...]] = ("*.lammpstrj", "*.lammpstrj.gz", "*.dump", "*.dump.gz", "dump.*")
+    summary: ClassVar[str] = "text dumps of LAMMPS and LIGGGHTS, by their content; also gzipped"
+    patterns: tuple[str, ...] = ("*.lammpstrj", "*.lammpstrj.gz", "*.dump", "*.dump.gz", "dump.*")
+    signature: ClassVar[bytes] = b"ITEM: "
 
     def frames(self, file: Path) -> Iterator[Frame]:
         before, repeated = None, 0

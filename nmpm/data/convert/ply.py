@@ -26,7 +26,8 @@ class Ply(FrameFormat):
 
     name: ClassVar[str] = "ply"
     summary: ClassVar[str] = f"PLY files of points, a file per frame (needs: {install('vtk')})"
-    patterns: ClassVar[tuple[str, ...]] = ("*.ply",)
+    patterns: tuple[str, ...] = ("*.ply",)
+    signature: ClassVar[bytes] = b"ply"
 
     def frames(self, file: Path) -> Iterator[Frame]:
         check_regular(file)

@@ -7,12 +7,20 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from nmpm._support.messages import counted
-from nmpm.data.convert.base import UNKNOWN_LENGTH, DatasetFormat, ForeignDataset, Options, split_files, split_runs
+from nmpm.data.convert.base import (
+    UNKNOWN_LENGTH,
+    DatasetFormat,
+    ForeignDataset,
+    Options,
+    is_selected,
+    split_files,
+    split_runs,
+)
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.metadata import find_family
 from nmpm.data.split_files import SPLITS
@@ -62,12 +70,7 @@ class RunFiles(DatasetFormat):
 
     Files are divided into splits as for `FileFormat`, or runs by their names. Where nothing divides them, the last
     tenths of the runs test and validate (`split_runs`); one or two long runs are cut along time, 80:10:10.
-
-    Attributes:
-        patterns: Of the files' names.
     """
-
-    patterns: ClassVar[tuple[str, ...]]
 
     def recognises(self, path: Path) -> bool:
         return bool(self.files(path))
@@ -90,7 +93,11 @@ class RunFiles(DatasetFormat):
 
     def files(self, path: Path) -> dict[str, tuple[Path, ...]]:
         """The files of each split; those that nothing divides are "all"."""
-        return split_files(path, *self.patterns, unsplit="all")
+        files = split_files(path, *self.patterns, unsplit="all")
+        kept = {
+            split: tuple(file for file in inside if is_selected(file, self.selected)) for split, inside in files.items()
+        }
+        return {split: inside for split, inside in kept.items() if inside}
 
     def open(self, path: Path, options: Options) -> ForeignDataset:
         files = self.files(path)

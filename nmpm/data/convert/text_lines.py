@@ -16,6 +16,7 @@ import numpy as np
 
 from nmpm._support.bounded_files import EXPANSION, check_regular, expansion_limit
 from nmpm.data.convert.base import readable
+from nmpm.errors import DataError
 
 _LINE_BYTES = 2**20
 _BUFFER_BYTES = 2**16
@@ -93,19 +94,34 @@ def complete_frames(lines: int) -> str:
 
 @contextmanager
 def open_lines(path: Path, kind: str) -> Iterator[Lines]:
-    """Opens a text file, gzipped if its name ends in `.gz`.
+    """Opens a text file, gzipped or not.
 
     Raises:
         DataError: naming the file, for its errors and any ValueError within; `kind` is what it should be.
     """
     check_regular(path)
-    packed, size = path.suffix.lower() == ".gz", path.stat().st_size
+    packed, size = _is_gzip(path), path.stat().st_size
     with (
         readable(path, kind, zlib.error, csv.Error),
         # The buffer reads lines several times faster than GzipFile.
         io.BufferedReader(gzip.GzipFile(path), _BUFFER_BYTES) if packed else path.open("rb") as file,
     ):
         yield Lines(file, expansion_limit(size) if packed else 2 * size + 1)
+
+
+def starts_with(path: Path, signature: bytes) -> bool:
+    """Whether a file, gzipped or not, begins with some bytes; damaged files do not."""
+    try:
+        check_regular(path)
+        with gzip.open(path) if _is_gzip(path) else path.open("rb") as file:
+            return file.read(len(signature)) == signature
+    except (OSError, EOFError, zlib.error, DataError):
+        return False
+
+
+def _is_gzip(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(2) == b"\x1f\x8b"
 
 
 def parse_columns(lines: Sequence[bytes], names: Sequence[str]) -> dict[str, np.ndarray]:

@@ -97,7 +97,7 @@ class Tracks(RunFiles):
 
     name: ClassVar[str] = "tracks"
     summary: ClassVar[str] = "tables of tracks (.csv, .tsv, .txt, .gz, .parquet): frame or time, id, x, y, z"
-    patterns: ClassVar[tuple[str, ...]] = SUFFIXES
+    patterns: tuple[str, ...] = SUFFIXES
 
     def recognises(self, path: Path) -> bool:
         first = next(iter(self.files(path).values()), ())[:1]

@@ -28,7 +28,7 @@ class Vtk(FrameFormat):
 
     name: ClassVar[str] = "vtk"
     summary: ClassVar[str] = f"VTK's .vtk, .vtp, .vtu, a file per frame, or .pvd (needs: {install('vtk')})"
-    patterns: ClassVar[tuple[str, ...]] = ("*.pvd", "*.vtp", "*.vtu", "*.vtk")
+    patterns: tuple[str, ...] = ("*.pvd", "*.vtp", "*.vtu", "*.vtk")
     listing: ClassVar[str] = "*.pvd"
 
     def frames(self, file: Path) -> Iterator[Frame]:
@@ -84,7 +84,19 @@ def _read(path: Path, time: float | None) -> Frame:
     if (ids := data.GetGlobalIds()) is not None:
         arrays["GlobalIds"] = vtk_to_numpy(ids).copy()
     left_out = () if fit else tuple(f"{name} of cells" for name in cell_arrays)
-    return Frame(position, arrays, _time(output) if time is None else time, left_out=left_out)
+    time = _time(output) if time is None else time
+    return Frame(position, arrays, time, left_out=left_out, surface=_has_faces(output))
+
+
+def _has_faces(output: Any) -> bool:
+    """Whether there are cells other than single points and sets of points."""
+    from vtkmodules.vtkCommonDataModel import VTK_POLY_VERTEX, VTK_VERTEX, vtkCellTypes
+
+    kinds = vtkCellTypes()
+    output.GetCellTypes(kinds)
+    return any(
+        kinds.GetCellType(index) not in (VTK_VERTEX, VTK_POLY_VERTEX) for index in range(kinds.GetNumberOfTypes())
+    )
 
 
 def _arrays(data: Any, convert: Any) -> dict[str, np.ndarray]:

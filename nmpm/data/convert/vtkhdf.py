@@ -30,7 +30,7 @@ class VtkHdf(FrameFormat):
 
     name: ClassVar[str] = "vtkhdf"
     summary: ClassVar[str] = "VTKHDF files of points (.vtkhdf), with time steps or a file per frame"
-    patterns: ClassVar[tuple[str, ...]] = ("*.vtkhdf",)
+    patterns: tuple[str, ...] = ("*.vtkhdf",)
 
     def frames(self, file: Path) -> Iterator[Frame]:
         with open_hdf5(file) as content:

@@ -30,7 +30,7 @@ class Xyz(FrameFormat):
 
     name: ClassVar[str] = "xyz"
     summary: ClassVar[str] = "XYZ and extended XYZ (.xyz, .extxyz), also gzipped"
-    patterns: ClassVar[tuple[str, ...]] = ("*.xyz", "*.extxyz", "*.xyz.gz", "*.extxyz.gz")
+    patterns: tuple[str, ...] = ("*.xyz", "*.extxyz", "*.xyz.gz", "*.extxyz.gz")
 
     def frames(self, file: Path) -> Iterator[Frame]:
         with open_lines(file, "XYZ") as lines:

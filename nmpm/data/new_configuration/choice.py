@@ -17,7 +17,7 @@ from nmpm.data.split_files import find_split, split_paths
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 
-OPTIONS = ("family", "gravity", "boundary", "bounds", "fields", "prescribed", "resample", "smooth")
+OPTIONS = ("family", "gravity", "boundary", "bounds", "fields", "prescribed", "resample", "smooth", "files")
 """Facts that a configuration can state in its section data."""
 FRAMES = 8
 MOST_GAIN = 0.05

@@ -1,12 +1,13 @@
 """Folders of runs with a file per frame, and files of many frames; as XYZ, whose frames any test can write."""
 
 import logging
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from nmpm.data.convert import convert, open_dataset
+from nmpm.data.convert import Options, convert, open_dataset
 from nmpm.data.format import Split, Trajectory, read_metadata
 from nmpm.errors import DataError
 
@@ -239,7 +240,13 @@ def test_a_plane_that_is_left_late_is_named(tmp_path):
 
 
 def add_other_series(run: Path) -> None:
-    (run / "wall_0.xyz").write_text("")
+    for number in range(T):
+        (run / f"other_{number}.xyz").write_text(frame_text(positions()[0]))
+
+
+def empty_all(run: Path) -> None:
+    for file in [*run.iterdir(), run / "mesh_0.xyz"]:
+        file.write_text("")
 
 
 def empty_the_last(run: Path) -> None:
@@ -257,18 +264,97 @@ def append_a_frame(run: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (add_other_series, r"run: files of 2 kinds: frame_\*.xyz \(12\), wall_\*.xyz \(1\). .*a folder of its own"),
+        (
+            add_other_series,
+            r"run: files of 2 kinds may be the particles: frame_\*.xyz \(12\), other_\*.xyz \(12\)\. State which:"
+            r" --files 'frame_\*.xyz'; kinds .* --files 'frame_\*.xyz,other_\*.xyz', join.* a folder of its own",
+        ),
+        (empty_all, r"run: no file in it has particles: frame_\*.xyz \(no frame\), mesh_\*.xyz \(no frame\)"),
         (empty_the_last, r"frame_11.xyz: there is no frame in it"),
         (cut_in_the_middle, "frame_5.xyz: cannot be read as XYZ"),
         (append_a_frame, "frame_5.xyz: there is more than one frame in it, but one in the first file"),
     ],
-    ids=["series", "empty", "cut", "many"],
+    ids=["series", "no particles", "empty", "cut", "many"],
 )
 def test_wrong_files_are_named(tmp_path, damage, message):
     write_run(tmp_path / "run")
     damage(tmp_path / "run")
     with pytest.raises(DataError, match=message):
         convert(tmp_path / "run", tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("others", "note"),
+    [
+        (
+            ["mesh_0.xyz", "mesh_1.xyz"],
+            r"the particles are frame_\*.xyz; left out: mesh_\*.xyz \(another kind of file\);",
+        ),
+        (["initial.xyz"], r"left out: initial.xyz \(another kind of file\); others are read by --files"),
+        (["log_0.xyz"], r"left out: log_\*.xyz \(cannot be read as XYZ"),
+    ],
+    ids=["name", "one", "content"],
+)
+def test_files_of_another_kind_beside_the_particles_are_left_out(tmp_path, others, note):
+    position = write_run(tmp_path / "run")
+    for name in others:
+        (tmp_path / "run" / name).write_text("no" if name.startswith("log") else frame_text(positions(particles=2)[0]))
+    dataset = open_dataset(tmp_path / "run")
+    assert any(re.search(note, line) for line in dataset.notes)
+    np.testing.assert_array_equal(next(dataset.splits["train"]()).position, position.astype("f4"))
+
+
+@pytest.mark.parametrize("bounds", [range(T), [0], [0, 5]], ids=["each", "first", "some"])
+def test_boundary_particles_join_as_walls(tmp_path, bounds):
+    """In files of their own, of all frames or of those from which on they are so."""
+    fluid, wall = positions(), np.repeat(positions(1, seed=1, particles=3), T, axis=0)
+    wall[5:] += 1 if len(bounds) == 2 else 0
+    (tmp_path / "run").mkdir()
+    columns = "pos:R:3:Idp:I:1"
+    for t in range(T):
+        text = frame_text(fluid[t], f"{columns}:heat:R:1", Idp=np.arange(N), heat=np.full(N, t))
+        (tmp_path / "run" / f"PartFluid_{t:04}.xyz").write_text(text)
+    for t in bounds:
+        (tmp_path / "run" / f"PartBound_{t:04}.xyz").write_text(frame_text(wall[t], columns, Idp=np.arange(3)))
+    trajectory = read(tmp_path / "run", tmp_path / "out")
+    metadata = read_metadata(tmp_path / "out")
+    assert metadata.particle_types == {0: "fluid", 1: "wall"}
+    assert metadata.static_types == (frozenset() if len(bounds) == 2 else {1})
+    np.testing.assert_array_equal(trajectory.particle_type, [0] * N + [1] * 3)
+    np.testing.assert_array_equal(trajectory.position, np.concatenate([fluid, wall], axis=1).astype("f4"))
+    assert "heat" not in trajectory.fields
+
+
+def test_files_that_are_selected_are_read_and_join_as_materials(tmp_path):
+    for seed, name in enumerate(["sand", "ice", "log"]):
+        write_run(tmp_path / name, seed)
+        for file in sorted((tmp_path / name).iterdir()):
+            target = tmp_path / "data" / "run" / f"{name}_{file.name}"
+            target.parent.mkdir(parents=True, exist_ok=True)
+            file.rename(target)
+    one = open_dataset(tmp_path / "data", options=Options(files="SAND_*"))
+    np.testing.assert_array_equal(next(one.splits["train"]()).position, positions(seed=0).astype("f4"))
+    both = open_dataset(tmp_path / "data", options=Options(files="run/sand_*.xyz, ice_*"))
+    assert both.metadata.particle_types == {0: "ice", 1: "sand"}
+    trajectory = next(both.splits["train"]())
+    np.testing.assert_array_equal(np.bincount(trajectory.particle_type), [N, N])
+    np.testing.assert_array_equal(trajectory.position[:, trajectory.particle_type == 1], positions(seed=0).astype("f4"))
+    with pytest.raises(DataError, match=r"--files snow_\*: no file of these names is of a format that is read"):
+        open_dataset(tmp_path / "data", options=Options(files="snow_*"))
+
+
+def test_lists_and_folders_of_walls_are_left_out(tmp_path):
+    for name in ("grains", "walls"):
+        write_frames(tmp_path / "data" / f"{name}.xyz", *map(frame_text, positions(seed=len(name))))
+    dataset = open_dataset(tmp_path / "data")
+    assert dataset.counts == {"train": 1}
+    assert any("left out by their names: walls.xyz; --files PATTERN reads them" in note for note in dataset.notes)
+    write_run(tmp_path / "out" / "particles")
+    write_run(tmp_path / "out" / "grids", 1)
+    dataset = open_dataset(tmp_path / "out")
+    assert dataset.counts == {"train": 1}
+    assert any("grids: left out by its name" in note for note in dataset.notes)
+    np.testing.assert_array_equal(next(dataset.splits["train"]()).position, positions().astype("f4"))
 
 
 def test_a_folder_of_datasets_is_refused(tmp_path):

@@ -55,6 +55,29 @@ def test_particles_are_sorted_by_id(tmp_path, name):
     assert any("z is 0 everywhere" in note for note in notes)
 
 
+@pytest.mark.parametrize("name", ["dump.{}", "dump{}.liggghts", "grains_{}.out", "post/{}.txt.gz", "{}"])
+@pytest.mark.parametrize("format_name", [None, "lammps"])
+def test_dumps_are_recognised_by_their_content(tmp_path, name, format_name):
+    position = positions()
+    for t in range(T):
+        file = tmp_path / "data" / "run" / name.format(500 * t)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        text = frame_text(500 * t, [(i, *position[t, i], 0) for i in range(N)], "id x y z").encode()
+        file.write_bytes(gzip.compress(text) if file.suffix == ".gz" else text)
+    (tmp_path / "data" / "run" / "log.lammps").write_text("LAMMPS\n")
+    (tmp_path / "data" / "run" / "in.sim").write_text("units si\n")
+    convert(tmp_path / "data", tmp_path / "out", format_name)
+    np.testing.assert_array_equal(Split(tmp_path / "out" / "train.h5").read(0).position, position.astype("f4"))
+
+
+def test_the_format_that_is_named_overrules_names(tmp_path):
+    position = dump(tmp_path / "grains.csv")
+    convert(tmp_path / "grains.csv", tmp_path / "out", "lammps")
+    np.testing.assert_array_equal(Split(tmp_path / "out" / "train.h5").read(0).position, position.astype("f4"))
+    with pytest.raises(DataError, match=r"grains.csv: no file \* there"):
+        convert(tmp_path / "grains.csv", tmp_path / "other", "ply")
+
+
 def test_a_file_per_frame(tmp_path):
     position = positions()
     (tmp_path / "run").mkdir()
