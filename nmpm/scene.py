@@ -47,6 +47,7 @@ class Scene:
         evolving: Names of per-particle fields that change in time and are predicted, such as a temperature.
         properties: Names of per-particle fields that are constant in time, such as a stiffness.
         parameters: Names of numbers that each trajectory has one of, such as a friction angle.
+        aliases: Pairs of a name that data give a material and the name that it has here, such as ("grains", "sand").
 
     Raises:
         ConfigError: if the facts contradict each other.
@@ -66,6 +67,7 @@ class Scene:
     properties: tuple[str, ...] = ()
     parameters: tuple[str, ...] = ()
     moving_obstacles: bool = False
+    aliases: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.boundary:
@@ -103,6 +105,8 @@ class Scene:
             raise ConfigError(f"Scene.densities = {self.densities} needs one entry for each of {self.materials}.")
         if not all(0 < density < math.inf for density in self.densities):
             raise ConfigError(f"Scene.densities = {self.densities} must be positive and finite.")
+        if unknown := [to for _, to in self.aliases if to not in self.materials]:
+            raise ConfigError(f"Scene.aliases: {unknown[0]!r} is none of the materials {self.materials}.")
         check_field_names(self.fields)
 
     @property
@@ -177,7 +181,7 @@ class Scene:
     def differences(self, other: Scene) -> tuple[str, ...]:
         """Names of the facts that differ between a model's scene and its data's, and may not.
 
-        Names of materials, their densities and fields are not compared.
+        Names of materials, their aliases, densities and fields are not compared.
         """
         facts = ("bounds", "domain", "dt", "boundary", "gravity", "gravity_varies", "obstacles", "moving_obstacles")
         different = [name for name in facts if getattr(self, name) != getattr(other, name)]
@@ -207,7 +211,7 @@ class Scene:
     def to_dict(self) -> dict[str, Any]:
         """The scene as plain lists, strings and numbers; without what is optional and absent."""
         plain = dataclasses.asdict(self)
-        for name in ("densities", "evolving", "properties", "parameters", "moving_obstacles"):
+        for name in ("densities", "evolving", "properties", "parameters", "moving_obstacles", "aliases"):
             if not plain[name]:
                 del plain[name]
         return {key: to_plain(value) for key, value in plain.items()}

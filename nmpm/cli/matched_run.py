@@ -17,6 +17,7 @@ from nmpm._support.plain_data import to_plain
 from nmpm.cli.early_checks import read_options, stated_keys
 from nmpm.cli.match_options import MATERIALS, STRICT, STRIDE, MatchOptions, describe
 from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.data.dataset import Dataset
 from nmpm.data.loading.sources import FolderSource
 from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.adaptation import adapted, with_members
@@ -27,6 +28,7 @@ from nmpm.training.checkpoints import COMPARED, read_checkpoint
 from nmpm.zoo.entries import load_checkpoint
 from nmpm.zoo.matching import match_data
 from nmpm.zoo.pretrained import Pretrained
+from nmpm.zoo.ranking import Ranking, Trial
 from nmpm.zoo.registry import load_model
 
 START_FROM = (
@@ -59,6 +61,7 @@ class MatchedRun:
         scene: Of the data, as they are.
         different: Arguments of the configuration that are not the model's, which take their place.
         left_out: Those of them that the configuration or an option states.
+        chosen: The model's material by the data's name, where neither options nor names tell; see `nmpm zoo match`.
     """
 
     model: Pretrained
@@ -66,6 +69,7 @@ class MatchedRun:
     scene: Scene
     different: tuple[str, ...]
     left_out: tuple[str, ...] = ()
+    chosen: Mapping[str, str] | None = None
 
     @classmethod
     def of(cls, config: Namespace, checkpoint: Path | None) -> MatchedRun | None:
@@ -80,20 +84,32 @@ class MatchedRun:
         data = TrajectoryDataModule(**config["data"].as_dict())
         if checkpoint is None and isinstance(data.data_source, FolderSource):
             data.data_source.split("train")  # refuses data without, before they are measured
-        if checkpoint is not None and not ((stored := stored_scene(checkpoint)) and stored.differences(data.scene)):
+        stored = stored_scene(checkpoint) if checkpoint else None
+        if checkpoint is not None and (stored is None or _is_of_kind(stored, data.scene)):
             return None
         model = load_model(str(start)) if checkpoint is None else load_checkpoint(checkpoint)
         if checkpoint is None:
             recipe = with_members(model.emulator.recipe, config["model"]["members"])
             model = dataclasses.replace(model, emulator=adapted(model.emulator, recipe))
-        match = match_data(model, data, *MatchOptions.read(config["materials"], config["stride"], config["strict"]))
+        given, chosen = MatchOptions.read(config["materials"], config["stride"], config["strict"]), None
+        try:
+            match = match_data(model, data, *given)
+        except ConfigError:
+            chosen = _choose_materials(model, data, given) if checkpoint is None else None
+            if chosen is None:
+                raise
+            match = match_data(model, data, *given._replace(materials=chosen))
         different = tuple(key for key in FORM if _differs(config["model"][key], match.recipe, key))
         stated = stated_keys(read_options(sys.argv[2:]), "model") if checkpoint is None else set()
-        return cls(model.matched(match), match, data.scene, different, tuple(k for k in different if k in stated))
+        left_out = tuple(key for key in different if key in stated)
+        return cls(model.matched(match), match, data.scene, different, left_out, chosen)
 
     def __str__(self) -> str:
         """Lines on how the model takes the data, and on what is left out of the configuration; none if neither."""
         how = describe(self.match, self.model.name) if not self._is_same_kind or self.match.warnings else ""
+        if self.chosen:
+            pairs = ",".join(f"{name}={to}" for name, to in self.chosen.items())
+            how += f"Chosen by short rollouts, as nmpm zoo match does: --materials {pairs}\n"
         if not self.left_out:
             return how
         names = ", ".join(f"model.{name}" for name in self.left_out)
@@ -114,6 +130,18 @@ class MatchedRun:
         if not self._is_same_kind:
             reading = self.match.reading
             config["data"]["reading"] = to_plain(reading) | {"scene": reading.scene.to_dict()}
+
+
+def _choose_materials(model: Pretrained, data: TrajectoryDataModule, given: MatchOptions) -> Mapping[str, str] | None:
+    """The materials of recorded data by which a model predicts them best; None where they are not what is missing."""
+    if given.materials is not None or not isinstance(data.data_source, FolderSource):
+        return None
+    trial = Trial.of(Dataset(data.data_source))
+    return Ranking(trial, stride=given.stride).best(model.name, model.emulator).stated
+
+
+def _is_of_kind(model: Scene, data: Scene) -> bool:
+    return model.aliases == data.aliases and not model.differences(data)
 
 
 def stored_scene(checkpoint: Path) -> Scene | None:

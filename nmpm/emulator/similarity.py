@@ -77,7 +77,8 @@ def find_match(
         emulator: The model.
         scene: The data's, in units of their own.
         motion: How the data move, as far as that has been measured.
-        materials: The model's material by the data's name; those left out are told by their names.
+        materials: The model's material by the data's name; those left out are as the aliases of the model's scene say,
+            or told by their names.
         stride: Frames of the data for one of the model, k or 1/k; the best of `STRIDES` if left out.
         strict: Whether to refuse what could not be matched.
         names: Of model and data, for messages.
@@ -92,9 +93,13 @@ def find_match(
         raise ConfigError(f"stride = {stride}: give k or 1/k frames of the data for one of the model, k whole.")
     measured = not scene.gravity_known and motion.gravity is not None
     scene = dataclasses.replace(scene, gravity=motion.gravity) if measured else scene
-    given, theirs = materials or {}, emulator.scene.materials
+    theirs = emulator.scene.materials
+    known = {name: to for name, to in emulator.scene.aliases if name in scene.materials}
+    given = known | dict(materials or {})
     renamed = match_materials(theirs, scene.materials, given, names)
-    search = _Search(emulator, _with_channels_of(emulator.scene, scene), motion, Experience.of(emulator))
+    aliases = tuple((name, to) for name, to in (dict(emulator.scene.aliases) | renamed).items() if to != name)
+    on_channels = dataclasses.replace(_with_channels_of(emulator.scene, scene), aliases=aliases)
+    search = _Search(emulator, on_channels, motion, Experience.of(emulator))
     recipe, step = search.find(stride, names)
     figures = Figures.of(scene, motion, recipe.grid.spacing, step)
     report = MatchReport(emulator.recipe, recipe, scene, step, search.seen, figures, measured, names)

@@ -140,14 +140,14 @@ class Ranking:
             try:
                 emulator = load()
                 if emulator.scene.dim == self.trial.scene.dim:
-                    standings.append(self._best(name, emulator))
+                    standings.append(self.best(name, emulator))
             except NmpmError as error:
                 standings.append(Standing(name, failure=one_line(error)))
             step(name)
         return sorted(standings, key=lambda one: one.error)
 
-    def _best(self, name: str, emulator: Emulator) -> Standing:
-        """With the materials that are stated or told by their names; else with the best that a few trials find."""
+    def best(self, name: str, emulator: Emulator) -> Standing:
+        """The standing of one model, with the materials that are stated, or told by names, or the best of a few."""
         theirs = emulator.scene.materials
         if self.materials is not None and set(self.materials.values()) <= set(theirs):
             return self._try(name, emulator, self.materials)

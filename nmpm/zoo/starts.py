@@ -65,11 +65,10 @@ def state_of(
     moving, obstacle = metadata.is_moving(types) & present, np.isin(types, list(metadata.obstacle_types)) & present
     if not moving.any():
         raise DataError(f"No particle that moves is there in frames {frame - back} and {frame} of the trajectory.")
-    renamed = {} if model.match is None else model.match.reading.materials
     state = model.state(
         position[moving],
         velocity=_velocity(model, trajectory, metadata, steps[:, moving], back),
-        material=_materials(model, metadata, types[moving], {**renamed, **(materials or {})}),
+        material=_materials(model, metadata, types[moving], {**dict(model.scene.aliases), **(materials or {})}),
         obstacle=position[obstacle] if obstacle.any() else None,
         gravity=_gravity(model, trajectory, metadata),
         fields=_fields(model, trajectory, frame, moving),

@@ -1,16 +1,19 @@
 """Fine-tuning from the command line: the weights that it starts with are the first checkpoint."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 import torch
 
-from nmpm import TrajectoryDataModule
+from nmpm import TrajectoryDataModule, load_trajectories
 from nmpm.cli import main
+from nmpm.data.format import write_metadata, write_split
 from nmpm.processors import Stochastic
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.zoo import Zoo
+from tests.made_up import made_up_metadata, made_up_trajectory
 
 TINY = """
 model:
@@ -37,6 +40,7 @@ PATIENT = {"class_path": "lightning.pytorch.callbacks.EarlyStopping"}
 def fit(make_dataset, tmp_path, monkeypatch):
     """Runs `nmpm fit` on made-up data with a learning rate and further words."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
     make_dataset(train=((30, 9),) * 2, valid=((30, 9),), test=((30, 9),)).rename(tmp_path / "data")
     Path("tiny.yaml").write_text(TINY)
 
@@ -117,3 +121,36 @@ def test_a_resumed_fine_tuning_keeps_the_start_among_the_best(fit):
     report = json.loads(Path("worse/report.json").read_text())
     assert [steps for _, steps, *_ in report["curve"]] == [0, 1, 2, 3, 4]
     assert "None of the validations in 4 steps" in report["progress"]
+
+
+def write_two_materials(folder: str, first: str, second: str) -> None:
+    runs = [made_up_trajectory(30, 10, seed) for seed in range(2)]
+    for run in runs:
+        run.particle_type[::2] = 8
+    for split in ("train", "valid", "test"):
+        write_split(Path(folder, f"{split}.h5"), runs)
+    write_metadata(Path(folder), made_up_metadata(particle_types={7: first, 8: second}))
+
+
+@pytest.mark.parametrize("stated", [["--materials", "type1=sand,type2=sand"], []], ids=["stated", "chosen"])
+def test_a_run_knows_which_materials_its_data_are(fit, stated, capsys):
+    write_two_materials("named", "sand", "water")
+    write_two_materials("grains", "type1", "type2")
+    fit("first", 1, 1e-3, "--data.path", "named")
+    capsys.readouterr()
+    fit("tuned", 1, 1e-3, "--data.path", "grains", "--start_from", "first", *stated)
+    said = capsys.readouterr().out
+    aliases = dict(Zoo.load("tuned").scene.aliases)
+    if stated:
+        assert aliases == {"type1": "sand", "type2": "sand"}
+        assert "Chosen" not in said
+    else:
+        pairs = re.search(r"Chosen by short rollouts, as nmpm zoo match does: --materials (\S+)\n", said)[1]
+        assert aliases == dict(pair.split("=") for pair in pairs.split(","))
+    assert main(["rollout", "tuned", "--data", "grains"]) == 0
+    assert main(["test", "tuned"]) == 0
+    assert main(["zoo", "add", "tuned", "entry", "--about", "Made up."]) == 0
+    for model in map(Zoo.load, ("tuned", "entry")):
+        assert model.start(load_trajectories("grains").test[0]).material.shape == (1, 10)
+    assert main(["fit", "--resume", "tuned", "--trainer.max_steps", "2"]) == 0
+    assert dict(Zoo.load("tuned").scene.aliases) == aliases

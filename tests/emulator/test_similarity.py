@@ -7,7 +7,7 @@ import pytest
 import torch
 from scenes import box, cloud, emulator_of
 
-from nmpm.emulator import rollout
+from nmpm.emulator import EmulatorRecipe, rollout
 from nmpm.emulator.similarity import find_match
 from nmpm.errors import ConfigError
 from nmpm.processors import UNet
@@ -114,6 +114,20 @@ def test_materials_are_told_by_their_names_or_asked_for():
     assert match.reading.scene.materials == ("water", "sand")
     with pytest.raises(ConfigError, match="'snad'"):
         find_match(emulator, scene, materials={"fluid": "snad"})
+
+
+def test_a_matched_model_knows_the_names_of_its_data_and_a_user_may_say_otherwise():
+    emulator = model_of(box(materials=("water", "sand")))
+    foreign = box(materials=("type1", "water"))
+    tuned = emulator.matched(find_match(emulator, foreign, materials={"type1": "sand", "water": "sand"}))
+    assert EmulatorRecipe.from_dict(tuned.recipe.to_dict()) == tuned.recipe
+    assert find_match(tuned, foreign).reading.materials == {"type1": "sand", "water": "sand"}
+    assert find_match(tuned, box(materials=("type1",))).reading.materials == {"type1": "sand"}
+    again = find_match(tuned, foreign, materials={"water": "water"})
+    assert again.reading.materials == {"type1": "sand"}
+    assert again.recipe.scene.aliases == (("type1", "sand"),)
+    with pytest.raises(ConfigError, match="aliases: 'sand' is none of the materials"):
+        box(materials=("water",), aliases=(("type1", "sand"),))
 
 
 def test_without_gravity_speeds_decide():

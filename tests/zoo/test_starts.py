@@ -9,9 +9,7 @@ from scenes import box
 
 from nmpm.data.format import Trajectory
 from nmpm.data.metadata import scene_metadata
-from nmpm.emulator.similarity import Match
 from nmpm.errors import ConfigError, DataError
-from nmpm.scene import Reading
 from tests.zoo.test_states import model_of
 
 SCENE = box(materials=("water", "sand"), obstacles=True)
@@ -98,7 +96,7 @@ def test_a_free_fall_starts_exactly_in_a_model_of_other_frames(ratio, frame):
 
 def test_a_match_knows_the_names_of_the_materials(model):
     trajectory = recorded(particle_types={0: "grit", 1: "brine", 2: "wall"})
-    reading = Reading(SCENE, {"grit": "sand", "brine": "water"})
-    matched = dataclasses.replace(model, match=Match(model.emulator.recipe, reading, (), ()))
+    foreign = dataclasses.replace(SCENE, materials=("grit", "brine"))
+    matched = model.fit_to(foreign, {"grit": "sand", "brine": "water"})
     assert matched.start(trajectory).material.tolist() == [[1, 1, 0, 0]]
     assert matched.start(trajectory, materials={"grit": "water"}).material.tolist() == [[0, 0, 0, 0]]

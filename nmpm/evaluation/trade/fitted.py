@@ -60,7 +60,7 @@ def fit_to_scenes(
         UserWarning: of what could not be matched.
     """
     differing, weights = emulator.scene.differences(scenes.scene), short_digest(emulator.state_dict())
-    if not differing and emulator.scene.materials == scenes.scene.materials:
+    if not differing and not emulator.scene.aliases and emulator.scene.materials == scenes.scene.materials:
         return FittedModel(name, weights, emulator)
     has_materials = set((materials or {}).values()) <= set(emulator.scene.materials)
     given = materials if has_materials else None
