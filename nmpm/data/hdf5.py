@@ -14,7 +14,7 @@ import os
 import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -68,7 +68,10 @@ def open_hdf5(path: Path) -> Iterator[Any]:
 
 
 def check_self_contained(file: Any, path: Path) -> None:
-    """Raises a DataError that names the link or dataset by which an open HDF5 file takes content from other files."""
+    """Raises a DataError that names the link or dataset by which an open HDF5 file takes content from other files.
+
+    Also for a dataset that a filter compressed that is not installed.
+    """
     # By hand: h5py's `visititems` recurses in C, and crashes the process in deep groups.
     pending, visited = [file], {file}
     while pending:
@@ -83,10 +86,28 @@ def check_self_contained(file: Any, path: Path) -> None:
             if isinstance(item, h5py.Group) and item not in visited:
                 visited.add(item)
                 pending.append(item)
-            elif isinstance(item, h5py.Dataset) and item.external:
+            elif isinstance(item, h5py.Dataset):
+                _check_filters(item, f"{path}: {where}")
+            if isinstance(item, h5py.Dataset) and item.external:
                 raise _elsewhere_error(path, f"{where!r} is stored in another file, {item.external[0][0]!r}")
-            elif isinstance(item, h5py.Dataset) and item.is_virtual and not _maps_within(file, item):
+            if isinstance(item, h5py.Dataset) and item.is_virtual and not _maps_within(file, item):
                 raise _elsewhere_error(path, f"{where!r} is a virtual dataset")
+
+
+def _check_filters(dataset: Any, where: str) -> None:
+    """Loads the filters that compressed a dataset; raises a DataError for one that is not installed."""
+    properties = dataset.id.get_create_plist()
+    for number in range(properties.get_nfilters()):
+        code, _, _, name = properties.get_filter(number)
+        if not h5py.h5z.filter_avail(code):
+            with suppress(ImportError):
+                import hdf5plugin  # noqa: F401 (registers its filters)
+        if not h5py.h5z.filter_avail(code):
+            called = f" ({one_line(name.decode('utf-8', 'replace'), 40)})" if name else ""
+            raise DataError(
+                f"{where} is compressed by the HDF5 filter {code}{called}, which is not installed: pip install"
+                " hdf5plugin has blosc, lz4, zstd and others. Or write it anew: h5repack -f GZIP=1 OLD NEW."
+            )
 
 
 def _maps_within(file: Any, dataset: Any) -> bool:

@@ -14,6 +14,13 @@ OTHER_NAMES = {
     "test": ("testing", "tst"),
 }
 
+_NO_DATA = frozenset({"Thumbs.db", "desktop.ini", "__MACOSX"})
+
+
+def is_no_data(name: str) -> bool:
+    """Whether files and folders of a name are hidden, or left by a system's file manager or archiver."""
+    return name.startswith(".") or name in _NO_DATA
+
 
 def describe_others(folder: Path) -> str:
     """The HDF5 files that a folder has, in brackets, for messages; nothing if there are none."""

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nmpm.data.convert import open_dataset
 from nmpm.data.format import Split, Trajectory, write_split
 from nmpm.data.hdf5 import FILTERS, writable_hdf5, write_compressed
 from nmpm.errors import DataError
@@ -188,3 +189,24 @@ def test_chunks_are_those_that_hdf5_writes(tmp_path_factory, length, width, rows
         np.testing.assert_array_equal(file["ours"][:], values)
         assert (file["ours"].dtype, file["ours"].chunks) == (values.dtype, file["theirs"].chunks)
         assert stored_chunks(file["ours"]) == stored_chunks(file["theirs"])
+
+
+def test_a_filter_that_is_not_installed_is_named(tmp_path):
+    properties, path = h5py.h5p.create(h5py.h5p.DATASET_CREATE), tmp_path / "a.h5"
+    properties.set_chunk((4, 5, 2))
+    properties.set_filter(60000, h5py.h5z.FLAG_OPTIONAL)  # nobody's
+    with h5py.File(path, "w") as file:
+        space, kind = h5py.h5s.create_simple((4, 5, 2)), h5py.h5t.IEEE_F32LE
+        h5py.h5d.create(file.id, b"position", kind, space, properties).write_direct_chunk((0, 0, 0), bytes(160), 0)
+    with pytest.raises(
+        DataError, match=r"a\.h5: position is compressed by the HDF5 filter 60000.*pip install hdf5plug"
+    ):
+        open_dataset(path, "arrays")
+
+
+def test_a_filter_of_the_plugins_is_used(tmp_path):
+    plugins = pytest.importorskip("hdf5plugin")
+    position = trajectories(1)[0].position
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("position", data=position, **plugins.Blosc())
+    np.testing.assert_array_equal(next(open_dataset(tmp_path / "a.h5").splits["train"]()).position, position)

@@ -26,6 +26,7 @@ from nmpm.data.convert.run_arrays import group_runs
 from nmpm.data.convert.run_files import Facts, Run, RunFiles
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
+from nmpm.data.split_files import is_no_data
 from nmpm.errors import DataError
 
 
@@ -72,7 +73,7 @@ def is_array_folder(path: Path) -> bool:
     """Whether the `.npy` files of a folder are positions and what belongs to them, not a run each."""
     if not path.is_dir():
         return False
-    names = {plain_name(file.stem) for file in path.glob("*.npy")}
+    names = {plain_name(file.stem) for file in _npy_files(path)}
     positions = names & set(USUAL_NAMES["position"])
     return bool(positions) and any(names - positions & set(usual) for usual in USUAL_NAMES.values())
 
@@ -85,7 +86,7 @@ def open_arrays(path: Path) -> Iterator[Arrays]:
         DataError: if it cannot be read, holds objects, or unpacks to far more than its size.
     """
     if path.is_dir():
-        yield {file.stem: _open_npy(file) for file in sorted(path.glob("*.npy"))}
+        yield {file.stem: _open_npy(file) for file in _npy_files(path)}
     elif path.suffix == ".npy":
         yield {"position": _open_npy(path)}
     elif path.suffix == ".npz":
@@ -96,6 +97,10 @@ def open_arrays(path: Path) -> Iterator[Arrays]:
         with open_hdf5(path) as file:
             check_self_contained(file, path)
             yield dict(_hdf5_arrays(file, path))
+
+
+def _npy_files(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.glob("*.npy") if not is_no_data(file.name))
 
 
 def _open_npy(path: Path) -> np.ndarray:
@@ -148,7 +153,9 @@ class NpzArray:
 
     def __getitem__(self, rows: int | tuple[()]) -> np.ndarray:
         if self.dtype.hasobject:
-            raise DataError(f"{self._where}: holds Python objects, which are not unpickled. Save arrays of numbers.")
+            raise DataError(
+                f"{self._where}: holds Python objects, which are not unpickled. Save numbers, or texts by .astype(str)."
+            )
         if isinstance(rows, tuple):
             return self._read(0, math.prod(self.shape)).reshape(self.shape, order="F" if self._fortran else "C")
         if self._fortran:

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Self, get_args
 from nmpm._support.messages import one_line, suggestion
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.metadata import STATIC_NAMES
-from nmpm.data.split_files import OTHER_NAMES, SPLITS
+from nmpm.data.split_files import OTHER_NAMES, SPLITS, is_no_data
 from nmpm.errors import ConfigError, DataError, NmpmError
 from nmpm.scene import Boundary, Interval, check_field_names
 
@@ -269,7 +269,8 @@ def split_files(path: Path, *patterns: str, unsplit: str = "test") -> dict[str, 
         return next((split for split in SPLITS if name.lower().startswith(split)), None) or find_split_name(*words)
 
     def matching(folder: Path) -> list[Path]:
-        return list({file: None for pattern in patterns for file in folder.glob(pattern)})
+        files = (file for pattern in patterns for file in folder.glob(pattern))
+        return list({file: None for file in files if not is_no_data(file.name)})
 
     if path.is_file():
         return {split_of(path.name) or unsplit: (path,)} if any(map(path.match, patterns)) else {}

@@ -10,7 +10,8 @@ import numpy as np
 
 from nmpm.data.convert.frame import ARRAY_NAMES, Frame
 from nmpm.data.convert.frame_files import FrameFormat
-from nmpm.data.convert.tables import Chunk, join_chunks, plain_column, read_chunks, read_columns
+from nmpm.data.convert.named_arrays import as_dates, as_times
+from nmpm.data.convert.tables import Chunk, as_numbers, join_chunks, plain_column, read_chunks, read_columns
 from nmpm.data.convert.tracks import USUAL_COLUMNS, coordinate_columns
 from nmpm.errors import DataError
 
@@ -34,13 +35,18 @@ class CsvFrames(FrameFormat):
         if not coordinates:
             raise DataError(f"{file}: no columns x, y of coordinates (found: {', '.join(names[:12]) or 'no header'}).")
         table = {name: np.zeros(0) for name in names} | join_chunks(list(read_chunks(file, names)))
-        texts = [name for name in coordinates if table[name].dtype.kind != "f"]
-        if texts:
-            raise DataError(f"{file}: the column {texts[0]} must contain numbers.")
-        position = np.stack([table.pop(name) for name in coordinates], axis=1)
+        columns = [as_numbers(table.pop(name), f"{file}: the column {name}") for name in coordinates]
+        position = np.stack(columns, axis=1)
         time = next((table[name] for name in table if plain_column(name) in USUAL_COLUMNS["time"]), np.zeros(0))
         arrays = {_name(name): table[name] for name in table if plain_column(name) not in _SAME_IN_FRAME}
-        yield Frame(position, arrays, float(time[0]) if len(time) and time.dtype.kind == "f" else None)
+        yield Frame(position, arrays, _first_time(time[:1], f"{file}: its time"))
+
+
+def _first_time(times: np.ndarray, what: str) -> float | np.datetime64 | None:
+    dates = as_dates(times)
+    if dates is not None:
+        return next(iter(dates), None)
+    return next(iter(as_times(times, what).tolist()), None)
 
 
 def _is_frame(file: Path) -> bool:

@@ -14,7 +14,9 @@ from nmpm.data.convert.named_arrays import (
     USUAL_NAMES,
     by_plain_name,
     component_names,
+    constant_axis,
     plain_name,
+    plane_notes,
     with_meaning,
 )
 from nmpm.scene import Boundary, Interval
@@ -36,7 +38,7 @@ class Frame:
 
     position: np.ndarray  # (N, D), NaN in all coordinates of particles that are not there
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict)  # (N,) or (N, k) by the names in the file
-    time: float | None = None  # in the file's unit
+    time: float | np.datetime64 | None = None  # in the file's unit
     step: int | None = None  # number of the simulator's step
     box: tuple[Interval, ...] | None = None  # (lower, upper) per axis, of the simulator
     boundary: tuple[Boundary, ...] | None = None  # of the box, per axis
@@ -86,13 +88,10 @@ def _fits(values: np.ndarray, other: np.ndarray | None) -> bool:
     )
 
 
-def flat_axes(frames: Sequence[Frame]) -> dict[int, float]:
-    """The axis of three along which all particles have the same coordinate, and that; empty if not just one has."""
+def flat_axes(frames: Sequence[Frame]) -> dict[str, float]:
+    """The `constant_axis` of the frames of three axes."""
     positions = [frame.position for frame in frames if frame.position.shape[1] == len(AXES)]
-    position = np.concatenate(positions) if positions else np.zeros((0, len(AXES)))
-    position = position[~np.isnan(position).any(axis=1)]
-    flat = np.flatnonzero(np.ptp(position, axis=0) == 0).tolist() if len(position) > 1 else []
-    return {axis: float(position[0, axis]) for axis in flat} if len(flat) == 1 else {}
+    return constant_axis(np.concatenate(positions)) if positions else {}
 
 
 @dataclass(frozen=True)
@@ -100,7 +99,7 @@ class Layout:
     """What the first frames tell about all."""
 
     axes: tuple[int, ...]  # those of the files that are kept
-    constant: Mapping[int, float]  # values of the axes that are left out, the same for all particles
+    constant: Mapping[str, float]  # values of the axes that are left out, the same for all particles
     id_name: str | None  # the array of the particles' ids
     left_out: tuple[str, ...]  # names of what else is in the files
 
@@ -108,7 +107,7 @@ class Layout:
     def of(cls, frames: Sequence[Frame]) -> Layout:
         """The layout of frames: an axis in which nothing has an extent is left out; ids differ in the first frame."""
         constant, first = flat_axes(frames), frames[0]
-        axes = tuple(axis for axis in range(first.position.shape[1]) if axis not in constant)
+        axes = tuple(axis for axis in range(first.position.shape[1]) if AXES[axis] not in constant)
         ids = {name: _integers(first.arrays[name]) for name in with_meaning("id", first.arrays)}
         unique = (name for name, values in ids.items() if values is not None and len(np.unique(values)) == len(values))
         id_name = next(unique, None)
@@ -117,8 +116,7 @@ class Layout:
 
     def notes(self) -> tuple[str, ...]:
         """For the user."""
-        kept = " and ".join(AXES[axis] for axis in self.axes)
-        notes = [f"{AXES[axis]} is {value:g} everywhere: 2-D data, of {kept}." for axis, value in self.constant.items()]
+        notes = [*plane_notes(self.constant)]
         notes += [f"Particles are matched by the array {self.id_name!r}."] if self.id_name else []
         left_out = ", ".join(self.left_out)
         return (*notes, *([f"Left out, as they are not numbers of all particles: {left_out}."] if left_out else []))
@@ -156,9 +154,10 @@ class ParticleArrays:
             axes: The axes of the positions that are kept; a velocity has them, too.
             id_name: The array of ids; None if there is none.
         """
-        left = {name: values for name, values in frame.arrays.items() if not _is_position(name, values)}
+        single = {n: v[:, 0] if v.ndim == 2 and v.shape[1] == 1 else v for n, v in frame.arrays.items()}
+        left = {name: values for name, values in single.items() if not _is_position(name, values)}
         identity = _integers(left.pop(id_name)) if id_name in left else None
-        present = _take(left, "active", _integers)
+        present = _take(left, "active", _logicals)
         types, type_names = _take(left, "types", _integers), _take(left, "types", _strings)
         velocity = _take(left, "velocity", partial(_vectors, axes=axes))
         velocity = _take_components(left, axes) if velocity is None else velocity
@@ -191,6 +190,11 @@ def _integers(values: np.ndarray) -> np.ndarray | None:
     return values.astype(np.int64)
 
 
+def _logicals(values: np.ndarray) -> np.ndarray | None:
+    texts = values.dtype.kind in "SU" and np.isin(values.astype(str), ("T", "F", "True", "False")).all()
+    return _integers(np.char.startswith(values.astype(str), "T")) if texts else _integers(values)
+
+
 def _strings(values: np.ndarray) -> np.ndarray | None:
     return values.astype(str) if values.ndim == 1 and values.dtype.kind in "SU" else None
 
@@ -215,7 +219,7 @@ def _scalars(name: str, values: np.ndarray) -> Iterable[tuple[str, np.ndarray]]:
     if values.dtype.kind not in "biuf":
         return []
     name = "particle_time" if name == "time" else name.replace("/", "_")
-    if values.ndim == 1 or values.shape[1] == 1:
-        return [(name, values.reshape(-1))]
+    if values.ndim == 1:
+        return [(name, values)]
     ends = AXES if values.shape[1] <= len(AXES) else range(values.shape[1])
     return [(f"{name}_{end}", column) for end, column in zip(ends, values.T, strict=False)]

@@ -51,7 +51,7 @@ from nmpm.data.convert.frame_stack import FrameStack
 from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, open_divided, placeholder_metadata
 from nmpm.data.convert.text_lines import starts_with
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.split_files import SPLITS
+from nmpm.data.split_files import SPLITS, is_no_data
 from nmpm.errors import DataError
 
 _DEPTH = 3  # of folders
@@ -121,9 +121,10 @@ class FrameFormat(DatasetFormat):
                 yield path.parent, files
             return
         for folder, inner, names in os.walk(path):
+            names = [name for name in names if not is_no_data(name)]
             lists = fnmatch.filter(names, self.listing)
             inner.sort(key=lambda name: number_order(Path(name)))
-            inner[:] = [name for name in inner if not name.startswith(".") and not lists]
+            inner[:] = [name for name in inner if not is_no_data(name) and not lists]
             if len(Path(folder).relative_to(path).parts) >= _DEPTH:
                 inner.clear()
             if files := self._matching(Path(folder), lists or names):

@@ -42,6 +42,7 @@ class FrameStack:
         self._ids = np.zeros(0, np.int64)  # of the slots
         self._last: tuple[np.ndarray, np.ndarray] | None = None  # ids of the last frame, and their slots
         self._times: list[float] = []
+        self._start: np.datetime64 | None = None  # where times are dates
         self._first = ""  # the first frame with particles
         self._empty = ""
         self._left_out: set[str] = set()
@@ -57,7 +58,11 @@ class FrameStack:
         else:
             self._empty = self._empty or where
             self._reserve(self._count + 1, self._particles)
-        self._times.append(np.nan if frame is None or frame.time is None else frame.time)
+        time = None if frame is None else frame.time
+        if isinstance(time, np.datetime64):
+            self._start = time if self._start is None else self._start
+            time = float((time - self._start) / np.timedelta64(1, "s"))
+        self._times.append(np.nan if time is None else time)
         self._count += 1
 
     def _add_particles(self, frame: Frame, where: str) -> None:
@@ -102,10 +107,11 @@ class FrameStack:
         if values.shape[1] != len(self._axes) + len(self._constant):
             raise DataError(f"{where}: {values.shape[1]} axes, unlike the first frame.")
         for axis, value in self._constant.items():
-            other = values[:, axis][(values[:, axis] != value) & ~np.isnan(values[:, axis])]
+            column = values[:, AXES.index(axis)]
+            other = column[(column != value) & ~np.isnan(column)]
             if len(other):
                 raise DataError(
-                    f"{where}: {AXES[axis]} = {other[0]:g}, but {value:g} for all particles of the first frames: the"
+                    f"{where}: {axis} = {other[0]:g}, but {value:g} for all particles of the first frames: the"
                     " data were taken as two-dimensional. Begin the run with a frame that is not flat."
                 )
         with np.errstate(over="ignore"):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from itertools import takewhile
 from typing import Any, Protocol
 
@@ -19,6 +20,8 @@ from nmpm.errors import DataError
 
 AXES = "xyz"
 """Names of the axes."""
+CONSTANT = "constant_axis"
+"""Key of the metadata: the axis that is left out, and the coordinate of all particles along it."""
 
 USUAL_NAMES: Mapping[str, tuple[str, ...]] = {
     "position": (
@@ -32,7 +35,10 @@ USUAL_NAMES: Mapping[str, tuple[str, ...]] = {
         "mk",
     ),
     "velocity": ("velocity", "velocities", "particlevelocities", "vel", "vels", "v"),
-    "active": ("active", "isactive", "alive", "present", "exists", "mask", "valid"),
+    "active": (
+        "active", "isactive", "alive", "isalive", "present", "ispresent", "exists", "exist", "visible", "mask", "valid",
+        "isvalid", "validity", "activemask", "validmask", "particlemask",
+    ),
     "id": (
         "id", "ids", "particle", "particleid", "particleids", "pid", "idp", "uid", "tag", "track", "trackid",
         "globalid", "globalids",
@@ -107,6 +113,35 @@ def as_text(values: np.ndarray) -> np.ndarray:
     )
 
 
+def as_dates(values: np.ndarray) -> np.ndarray | None:
+    """Dates, or texts in ISO 8601, as datetime64 in UTC; None for anything else."""
+    if values.dtype.kind == "M":
+        return values
+    if values.dtype.kind not in "SUO":
+        return None
+    try:
+        dates = [datetime.fromisoformat(text) if text else None for text in as_text(values).flat]
+    except ValueError:
+        return None
+    naive = [date.astimezone(UTC).replace(tzinfo=None) if date and date.tzinfo else date for date in dates]
+    return np.array(naive, "M8[us]").reshape(values.shape)
+
+
+def as_times(values: np.ndarray, what: str) -> np.ndarray:
+    """Times as float64, those of dates in seconds since the first; raises a DataError, naming what it is, for texts."""
+    if values.dtype.kind in "biuf":
+        return values.astype(np.float64)
+    if values.dtype.kind == "m":
+        return np.asarray(values / np.timedelta64(1, "s"))
+    dates = as_dates(values)
+    if dates is None:
+        example = one_line(str(as_text(values).reshape(-1)[0]), 40)
+        raise DataError(
+            f"{what} must contain numbers, or dates such as 2026-05-31T12:00:00.5; it has {example!r}. Give seconds."
+        )
+    return np.asarray((dates - np.fmin.reduce(dates.reshape(-1))) / np.timedelta64(1, "s"))
+
+
 def type_ids(names: np.ndarray, ids: Mapping[str, int], where: str) -> np.ndarray:
     """The ids of types by their names, in the shape of `names`; raises a DataError for a name without id."""
     unique, index = np.unique(names, return_inverse=True)
@@ -120,13 +155,41 @@ def type_ids(names: np.ndarray, ids: Mapping[str, int], where: str) -> np.ndarra
     return np.array([ids[name] for name in unique.tolist()], np.int64)[index].reshape(names.shape)
 
 
-def drop_axes(position: np.ndarray, dim: int, where: str) -> np.ndarray:
-    """The first axes of (…, D) positions; raises a DataError if the others are not 0 everywhere."""
-    if position.shape[-1] < dim:
+def constant_axis(position: np.ndarray) -> dict[str, float]:
+    """The name of the axis of three along which all of (…, 3) positions are the same, and that; else empty."""
+    points = position[~np.isnan(position).any(axis=-1)]
+    if position.shape[-1] != len(AXES) or len(points) < 2:
+        return {}
+    flat = np.flatnonzero(np.ptp(points, axis=0) == 0).tolist()
+    return {AXES[axis]: float(points[0, axis]) for axis in flat} if len(flat) == 1 else {}
+
+
+def plane_notes(constant: Mapping[str, float]) -> tuple[str, ...]:
+    """A note for the user on the axis that is left out, if there is one."""
+    kept = " and ".join(axis for axis in AXES if axis not in constant)
+    return tuple(f"{axis} is {value:g} everywhere: 2-D data, of {kept}." for axis, value in constant.items())
+
+
+def drop_axis(values: np.ndarray, constant: Mapping[str, float]) -> np.ndarray:
+    """(…, 3) values of the axes of space without the constant axis; others as they are."""
+    names = list(constant) if values.shape[-1] == len(AXES) else []
+    return np.delete(values, [AXES.index(axis) for axis in names], axis=-1)
+
+
+def in_plane(position: np.ndarray, dim: int, constant: Mapping[str, float], where: str) -> np.ndarray:
+    """(…, D) positions of the axes that the first run has; raises a DataError if the constant axis is not one here."""
+    for axis, value in constant.items() if position.shape[-1] == len(AXES) else ():
+        values = position[..., AXES.index(axis)]
+        other = values[(values != value) & ~np.isnan(values)]
+        if other.size:
+            raise DataError(
+                f"{where}: {axis} is {value:g} in the first run, but not here ({other[0]:g}). Give all runs the same"
+                " number of axes."
+            )
+    position = drop_axis(position, constant)
+    if position.shape[-1] != dim:
         raise DataError(f"{where}: positions have {position.shape[-1]} axes, those of the first run have {dim}.")
-    if np.nan_to_num(position[..., dim:]).any():
-        raise DataError(f"{where}: z is 0 in the first run, but not here. Give all runs the same number of axes.")
-    return position[..., :dim]
+    return position
 
 
 def plain_name(name: str) -> str:
@@ -185,12 +248,12 @@ def usual_position(arrays: Arrays) -> str | None:
 def find_roles(arrays: Arrays, position: str) -> dict[str, str]:
     """Name of the array of each meaning; its shape must fit."""
     *runs, frames, particles, dim = arrays[position].shape
-    at_particles = [(particles,), (frames, particles)]
+    at_particles = [(particles,), (frames, particles), (particles, 1), (frames, particles, 1)]
     shapes: dict[str, list[tuple[int, ...]]] = {
-        "types": [(), *at_particles, (frames,)],  # (frames,) where the axes of positions are swapped
+        "types": [(), *at_particles, (frames,), (frames, 1)],  # (frames,) where the axes of positions are swapped
         "velocity": [(frames, particles, dim)],
         "active": at_particles,
-        "time": [(frames,)],
+        "time": [(frames,), (frames, 1)],
         "dt": [(), (1,)],
         "gravity": [(dim,), (3,)],
         "bounds": [(dim, 2), (2, dim)],
@@ -201,6 +264,8 @@ def find_roles(arrays: Arrays, position: str) -> dict[str, str]:
         shape = tuple(array.shape)
         if meaning in _LISTS:
             return len(shape) == 1 and array.dtype.kind in _LISTS[meaning]
+        if array.dtype.kind not in "biuf" and meaning not in _TEXTS:
+            return False
         return shape in shapes[meaning] or any(shape == (*runs, *one) for one in shapes[meaning])
 
     others = [name for name in arrays if name != position]
@@ -213,6 +278,8 @@ def find_roles(arrays: Arrays, position: str) -> dict[str, str]:
 
 _LISTS = {"type_names": "SUO", "static_types": "iu", "boundary": "SUO"}
 """Kinds of the numbers or texts of facts that are lists of any length."""
+_TEXTS = ("types", "active", "time")
+"""Meanings of arrays that may be of texts, or of dates."""
 
 
 def join_components(arrays: Arrays) -> Arrays:

@@ -14,7 +14,7 @@ from nmpm.data.convert.array_files import ArrayFiles, open_arrays
 from nmpm.data.convert.named_arrays import Arrays, can_be_positions, describe, with_meaning
 from nmpm.data.convert.tables import SUFFIXES
 from nmpm.data.convert.tracks import table_columns
-from nmpm.data.split_files import SPLITS
+from nmpm.data.split_files import SPLITS, is_no_data
 from nmpm.errors import NmpmError
 
 _PAGE = "docs/howto/your_data.md shows all forms."
@@ -72,7 +72,8 @@ def describe_several(path: Path, datasets: Sequence[Path]) -> str:
 
 def subfolders(path: Path) -> Iterator[Path]:
     """The folders in a folder, in the order of their names; none in a file."""
-    return (inner for inner in sorted(path.glob("*")) if inner.is_dir()) if path.is_dir() else iter(())
+    inside = sorted(path.glob("*")) if path.is_dir() else ()
+    return (inner for inner in inside if inner.is_dir() and not is_no_data(inner.name))
 
 
 def has_splits(folder: Path) -> bool:
@@ -84,8 +85,8 @@ def _files(path: Path) -> Iterator[Path]:
     if path.is_file():
         yield path
     for folder, inner, names in os.walk(path):
-        inner.sort()
-        yield from (Path(folder, name) for name in sorted(names) if not name.startswith("."))
+        inner[:] = sorted(name for name in inner if not is_no_data(name))
+        yield from (Path(folder, name) for name in sorted(names) if not is_no_data(name))
 
 
 def _array_problem(file: Path) -> str:

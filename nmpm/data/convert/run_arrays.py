@@ -14,19 +14,25 @@ import numpy as np
 from nmpm.data.array_checks import check_axes
 from nmpm.data.convert.base import find_split_name, located
 from nmpm.data.convert.named_arrays import (
+    AXES,
+    CONSTANT,
     ArrayLike,
     Arrays,
     as_text,
+    as_times,
     can_be_positions,
+    constant_axis,
     describe,
-    drop_axes,
+    drop_axis,
     find_roles,
+    in_plane,
     join_components,
+    plane_notes,
     position_name,
     type_ids,
     usual_position,
 )
-from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, FLAT, Facts, cut, placeholder_metadata
+from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Facts, cut, placeholder_metadata
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.errors import DataError
 from nmpm.scene import Boundary, Interval
@@ -101,33 +107,43 @@ class RunArrays:
     def _fact(self, meaning: str, run: int = 0) -> np.ndarray | None:
         """The array of a meaning in a run; None where there is none."""
         name = self.roles.get(meaning)
-        return None if name is None else self._take(name, run)
+        if name is None:
+            return None
+        values = self._take(name, run)
+        return self._without_last(values) if meaning in ("types", "active", "time") else values
+
+    def _without_last(self, values: np.ndarray) -> np.ndarray:
+        """(T, N, 1), (N, 1) and (T, 1) values of particles or frames without their last axis."""
+        sizes = self._shape[-3:-1]
+        shapes = (sizes, sizes[1:], sizes[:1])
+        one = values.ndim > 1 and values.shape[-1] == 1 and values.shape not in shapes
+        return values[..., 0] if one and values.shape[:-1] in shapes else values
 
     def facts(self) -> Facts:
         """Metadata from the arrays, names of those that are unknown, and notes on how arrays are read."""
-        position = self._take(self.roles["position"], 0)
-        flat = position.shape[2] == 3 and not np.nan_to_num(position[..., 2]).any()
-        dim = position.shape[2] - flat
-        stated = self._stated(dim)
+        constant = constant_axis(self._position(0, self.where))
+        dim = self._shape[-1] - len(constant)
+        stated = self._stated(dim, constant)
         unknown = EVERYTHING_UNKNOWN - {*stated, *({"gravity"} & set(self.roles))}
         taken = {*self.roles.values(), *self.field_names}
         rest = {name: array for name, array in self.arrays.items() if name not in taken}
         shapes = (f"{meaning} {name!r} {tuple(self.arrays[name].shape)}" for meaning, name in self.roles.items())
         fields = f"; fields {', '.join(self.field_names)}" if self.field_names else ""
         left_out = f" Left out, as they fit neither: {describe(rest, len(rest))}." if rest else ""
-        notes = (f"Arrays: {', '.join(shapes)}{fields}.{left_out}", *((FLAT,) if flat else ()))
-        return placeholder_metadata(dim, **stated), unknown, notes
+        notes = (f"Arrays: {', '.join(shapes)}{fields}.{left_out}", *plane_notes(constant))
+        return placeholder_metadata(dim, **stated, extra={CONSTANT: constant} if constant else {}), unknown, notes
 
-    def _stated(self, dim: int) -> dict[str, Any]:
+    def _stated(self, dim: int, constant: Mapping[str, float]) -> dict[str, Any]:
         """Fields of `Metadata` that arrays state, for data of so many axes."""
-        facts: dict[str, Any] = {"particle_types": self._type_names(), "bounds": self._bounds()[:dim]}
+        bounds = [bound for axis, bound in zip(AXES, self._bounds(), strict=False) if axis not in constant]
+        facts: dict[str, Any] = {"particle_types": self._type_names(), "bounds": tuple(bounds)}
         for name in ("dt", "particle_volume"):
             value = self._fact(name)
             if value is not None and np.isfinite(value).all() and (value > 0).all():
                 facts[name] = float(value.reshape(-1)[0])
         boundary, static = self._fact("boundary"), self._fact("static_types")
         if boundary is not None and set(as_text(boundary)) <= set(get_args(Boundary)):
-            facts["boundary"] = tuple(as_text(boundary).tolist()[:dim])
+            facts["boundary"] = tuple(drop_axis(as_text(boundary), constant).tolist()[:dim])
         if static is not None and facts["particle_types"]:
             facts["static_types"] = frozenset(static.tolist())
         return {name: value for name, value in facts.items() if value or name == "static_types"}
@@ -155,18 +171,32 @@ class RunArrays:
             DataError: if arrays do not fit together, naming the file and run.
         """
         where = f"{self.where}, run {run}" if self._shape[:-3] else self.where
-        position = self._take(self.roles["position"], run).astype(np.float32)  # a copy, where absent becomes NaN
+        position, constant = self._position(run, where), metadata.extra.get(CONSTANT, {})
         types = self._types(run, position.shape[:2], metadata, where)
         check_axes(position, None if types is None else types.shape[-1], where)
-        position = drop_axes(position, metadata.dim, where)
-        fixed = np.zeros(position.shape[1], np.int64) if types is None else _constant_types(types, position, where)
-        self._mark_absent(run, position, where)
-        gravity = self._fact("gravity", run)
-        stated = gravity is not None and gravity.ndim == 1 and len(gravity) >= metadata.dim
-        attributes = {"gravity": gravity[: metadata.dim].astype(np.float64)} if gravity is not None and stated else {}
+        position = in_plane(position, metadata.dim, constant, where)
+        fixed = np.zeros(position.shape[1], np.int64) if types is None else _constant_types(types, where)
+        gravity, attributes = self._fact("gravity", run), {}
+        if gravity is not None and gravity.ndim == 1 and len(gravity) >= metadata.dim:
+            attributes = {"gravity": drop_axis(gravity, constant)[: metadata.dim].astype(np.float64)}
         with located(where):
-            trajectory = Trajectory(position, fixed, attributes, self._fields(run, metadata.dim))
+            trajectory = Trajectory(position, fixed, attributes, self._fields(run, constant, where))
         return cut(trajectory, range(len(position)))
+
+    def _position(self, run: int, where: str) -> np.ndarray:
+        """(T, N, D) float32 positions, NaN where a mask of 0 or a type of -1 says that a particle is absent."""
+        position = self._take(self.roles["position"], run).astype(np.float32)
+        sizes, active, types = position.shape[:2], self._fact("active", run), self._fact("types", run)
+        if active is not None:
+            name = self.roles["active"]
+            if not np.isin(active, (0, 1)).all():
+                raise DataError(f"{where}: {name} must be 0 where a particle is absent, and 1 elsewhere.")
+            if active.shape not in (sizes, sizes[1:]):
+                raise DataError(f"{where}: {name} {active.shape} must be (T, N) = {sizes}, or (N,).")
+            position[~np.broadcast_to(active.astype(bool), sizes)] = np.nan
+        if types is not None and types.dtype.kind in "if" and types.shape in (sizes, sizes[1:]):
+            position[np.broadcast_to(types == -1, sizes)] = np.nan
+        return position
 
     def _types(self, run: int, sizes: tuple[int, ...], metadata: Metadata, where: str) -> np.ndarray | None:
         """(N,) or (T, N) type ids."""
@@ -185,33 +215,21 @@ class RunArrays:
             raise DataError(f"{where}: {name} must be whole numbers.")
         return values.astype(np.int64)
 
-    def _mark_absent(self, run: int, position: np.ndarray, where: str) -> None:
-        active = self._fact("active", run)
-        if active is None:
-            return
-        name = self.roles["active"]
-        if not np.isin(active, (0, 1)).all():
-            raise DataError(f"{where}: {name} must be 0 where a particle is absent, and 1 elsewhere.")
-        if active.shape not in (position.shape[:2], position.shape[1:2]):
-            raise DataError(f"{where}: {name} {active.shape} must be (T, N) = {position.shape[:2]}, or (N,).")
-        position[~np.broadcast_to(active.astype(bool), position.shape[:2])] = np.nan
-
-    def _fields(self, run: int, dim: int) -> dict[str, np.ndarray]:
-        fields = {name.replace("/", "_"): self._take(name, run) for name in self.field_names}
+    def _fields(self, run: int, constant: Mapping[str, float], where: str) -> dict[str, np.ndarray]:
+        fields = {name.replace("/", "_"): self._without_last(self._take(name, run)) for name in self.field_names}
         velocity, time = self._fact("velocity", run), self._fact("time", run)
         if velocity is not None:
-            fields["velocity"] = velocity[..., :dim].astype(np.float32)
+            fields["velocity"] = drop_axis(velocity, constant).astype(np.float32)
         if time is not None:
-            fields["time"] = time.astype(np.float64)
+            fields["time"] = as_times(time, f"{where}: {self.roles['time']}")
         return fields
 
 
-def _constant_types(types: np.ndarray, position: np.ndarray, where: str) -> np.ndarray:
-    """(N,) types; positions become NaN where the type is -1."""
-    absent = types == -1
-    position[absent if types.ndim == 2 else (slice(None), absent)] = np.nan
+def _constant_types(types: np.ndarray, where: str) -> np.ndarray:
+    """(N,) types of (N,) or (T, N) ones, which are -1 where a particle is absent."""
     if types.ndim == 1:
         return types
+    absent = types == -1
     fixed: np.ndarray = np.take_along_axis(types, absent.argmin(axis=0)[None], axis=0)[0]
     changes = (types != fixed) & ~absent
     if changes.any():

@@ -33,8 +33,6 @@ EVERYTHING_UNKNOWN = frozenset(
     {"bounds", "dt", "gravity", "static_types", "boundary", "particle_volume", "sequence_length", "particle_types"}
 )
 
-FLAT = "z is 0 everywhere: the data are 2-D."
-
 Facts = tuple[Metadata, frozenset[str], tuple[str, ...]]
 """Metadata, names of its fields that are unknown, and notes for the user."""
 

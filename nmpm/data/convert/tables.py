@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.bounded_files import check_regular
-from nmpm._support.messages import install
+from nmpm._support.messages import install, one_line
 from nmpm._support.progress import progress_bar
 from nmpm.data.convert.base import readable
 from nmpm.data.convert.text_lines import Lines, is_number, open_lines
@@ -26,7 +26,7 @@ _LARGE = 32  # MiB of a file beyond which its progress is shown
 _BLOCK = 2**22  # bytes that are parsed at a time
 
 Chunk = Mapping[str, np.ndarray]
-"""Columns by name, floats or texts."""
+"""Columns by name: floats, dates or texts."""
 
 
 def read_columns(path: Path) -> tuple[str, ...]:
@@ -94,12 +94,14 @@ def _parse(rows: list[str], names: Sequence[str], delimiter: str | None) -> Chun
             return dict(zip(names, numbers.T, strict=True))
     except ValueError:  # texts, empty cells
         pass
-    cells = [row.split() for row in rows] if delimiter is None else list(csv.reader(rows, delimiter=delimiter))
+    cells = (
+        [_split(row, delimiter) for row in rows] if delimiter is None else list(csv.reader(rows, delimiter=delimiter))
+    )
     while cells and not any(map(is_number, cells[0])):  # labels and units below the header have no numbers
         cells.pop(0)
     if any(len(row) != len(names) for row in cells):
         return None
-    return {name: _column([row[index] for row in cells]) for index, name in enumerate(names) if cells}
+    return {name: _column([row[index] for row in cells], delimiter) for index, name in enumerate(names) if cells}
 
 
 def _cells_error(path: Path, lines: list[str], first: int, count: int, delimiter: str | None) -> DataError:
@@ -107,17 +109,23 @@ def _cells_error(path: Path, lines: list[str], first: int, count: int, delimiter
     for number, line in enumerate(lines, start=first + 1):
         cells = len(_split(line, delimiter)) if line.strip() and line[0] not in "#%" else count
         if cells != count:
-            return DataError(f"{path}, line {number}: it has {cells} cells, the header has {count}.")
+            commas = delimiter == "," and re.search(r"\d,\d", line) is not None and cells > count
+            mend = " If commas are decimal, separate cells by semicolons." if commas else ""
+            return DataError(f"{path}, line {number}: it has {cells} cells, the header has {count}.{mend}")
     return DataError(f"{path}: rows have another number of cells than the header, {count}.")
 
 
 def _header(lines: Lines) -> tuple[tuple[str, ...], str | None]:
-    """Names of columns, and the delimiter (None for blanks)."""
+    """Names of columns, and the delimiter (None for blanks), which a first line such as "sep=;" may state."""
+    stated = None
     for _ in range(100):
-        text = lines.next().strip().lstrip("\ufeff#%").strip()
+        text = lines.next().strip().lstrip("#%").strip()
+        if spreadsheet := re.fullmatch('"?sep=(.?)"?', text, re.IGNORECASE):
+            stated = spreadsheet[1] or "\t"
+            continue
         if not text:
             continue
-        delimiter = next((sign for sign in "\t;," if sign in text), None)
+        delimiter = stated or next((sign for sign in "\t;," if sign in text), None)
         names = [name or f"column {index}" for index, name in enumerate(_split(text, delimiter))]  # pandas' index
         named = len(set(names)) == len(names) and not any(map(is_number, names))
         return (tuple(names) if named and len(names) > 1 else (), delimiter)
@@ -129,18 +137,35 @@ def _split(text: str, delimiter: str | None) -> list[str]:
     return [cell.strip().strip('"') for cell in cells]
 
 
-def _column(cells: list[str]) -> np.ndarray:
-    """Numbers, NaN for empty cells; texts if a cell is no number."""
+def _column(cells: list[str], delimiter: str | None) -> np.ndarray:
+    """Numbers, also logical ones, NaN for empty cells; texts if a cell is none of these.
+
+    Decimal commas are points where cells have another delimiter.
+    """
     texts = np.array(cells)
     try:
         return texts.astype(np.float64)
     except ValueError:
         pass
     texts = np.char.strip(texts)
+    numbers = np.where(np.isin(texts, ("", "NA", "N/A", "null", "None", "-")), "nan", texts)
+    words = np.char.lower(numbers)
+    if np.isin(words, ("true", "false", "nan")).all():
+        numbers = np.where(words == "true", "1", np.where(words == "false", "0", "nan"))
+    if delimiter != ",":
+        numbers = np.char.replace(numbers, ",", ".")
     try:
-        return np.where(np.isin(texts, ("", "NA", "N/A", "null", "None", "-")), "nan", texts).astype(np.float64)
+        return numbers.astype(np.float64)
     except ValueError:
         return texts
+
+
+def as_numbers(values: np.ndarray, what: str) -> np.ndarray:
+    """The numbers of a column; raises a DataError, naming what it is, for texts."""
+    if values.dtype.kind != "f":
+        number = next((index for index, text in enumerate(values.tolist()) if not is_number(text)), 0)
+        raise DataError(f"{what} must contain numbers, but has {one_line(str(values[number]), 40)!r}.")
+    return values
 
 
 @contextmanager
@@ -159,9 +184,11 @@ def _arrow_column(column: Any) -> np.ndarray:
     values = np.asarray(column.to_numpy(zero_copy_only=False))
     if values.dtype.kind in "biuf":
         return values.astype(np.float64)
-    if values.dtype.kind in "mM":  # dates and durations, in seconds
-        return values.astype(f"{values.dtype.kind}8[ns]").astype(np.int64) * 1e-9
-    return _column(["" if item is None else str(item) for item in values.tolist()])
+    if values.dtype.kind == "m":  # durations, in seconds
+        return values / np.timedelta64(1, "s")
+    if values.dtype.kind == "M":
+        return values
+    return _column(["" if item is None else str(item) for item in values.tolist()], ",")
 
 
 def plain_column(name: str) -> str:

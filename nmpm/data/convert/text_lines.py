@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import gzip
 import io
+import re
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -101,12 +103,25 @@ def open_lines(path: Path, kind: str) -> Iterator[Lines]:
     """
     check_regular(path)
     packed, size = _is_gzip(path), path.stat().st_size
+    limit = expansion_limit(size) if packed else 2 * size + 1
     with (
         readable(path, kind, zlib.error, csv.Error),
         # The buffer reads lines several times faster than GzipFile.
         io.BufferedReader(gzip.GzipFile(path), _BUFFER_BYTES) if packed else path.open("rb") as file,
     ):
-        yield Lines(file, expansion_limit(size) if packed else 2 * size + 1)
+        yield Lines(_as_utf8(file, limit), limit)
+
+
+def _as_utf8(file: io.BufferedReader[Any], limit: int) -> io.BufferedReader[Any]:
+    """A text file in UTF-8 without its mark; one in UTF-16, as Excel writes it, is read whole, up to a limit."""
+    start = file.peek(4)[:4]
+    if start.startswith(codecs.BOM_UTF8):
+        file.read(len(codecs.BOM_UTF8))
+    little = start.startswith(codecs.BOM_UTF16_LE) or start[1::2] == b"\0\0"
+    if not little and not start.startswith(codecs.BOM_UTF16_BE) and start[::2] != b"\0\0":
+        return file
+    text = file.read(limit).decode("utf-16-le" if little else "utf-16-be", "replace")
+    return io.BufferedReader(io.BytesIO(text.removeprefix("\ufeff").encode()))
 
 
 def starts_with(path: Path, signature: bytes) -> bool:
@@ -137,6 +152,8 @@ def parse_columns(lines: Sequence[bytes], names: Sequence[str]) -> dict[str, np.
     numbers = [index for index in range(len(names)) if index not in texts]
     if not lines:
         return {name: np.zeros(0) for name in names}
+    if any(re.fullmatch(rb"[-+]?\d*,\d+([eE][-+]?\d+)?", first[index]) for index in texts):
+        raise ValueError("its numbers have decimal commas; write points")
     values = np.loadtxt(lines, comments=None, usecols=numbers, ndmin=2)
     if len(values) != len(lines):
         raise ValueError("an empty line among those of particles")

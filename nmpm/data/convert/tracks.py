@@ -18,9 +18,29 @@ from typing import ClassVar
 import numpy as np
 
 from nmpm._support.messages import counted
-from nmpm.data.convert.named_arrays import component_names, drop_axes, type_ids
-from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, FLAT, Facts, Run, RunFiles, placeholder_metadata
-from nmpm.data.convert.tables import SUFFIXES, Chunk, join_chunks, one_cell, plain_column, read_chunks, read_columns
+from nmpm.data.convert.named_arrays import (
+    AXES,
+    CONSTANT,
+    USUAL_NAMES,
+    as_times,
+    component_names,
+    constant_axis,
+    drop_axis,
+    in_plane,
+    plane_notes,
+    type_ids,
+)
+from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Facts, Run, RunFiles, placeholder_metadata
+from nmpm.data.convert.tables import (
+    SUFFIXES,
+    Chunk,
+    as_numbers,
+    join_chunks,
+    one_cell,
+    plain_column,
+    read_chunks,
+    read_columns,
+)
 from nmpm.data.convert.track_rows import TrackRows, frame_numbers
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.errors import DataError, NmpmError
@@ -39,6 +59,7 @@ USUAL_COLUMNS: Mapping[str, tuple[str, ...]] = {
         "run", "runid", "trajectory", "trajectoryid", "traj", "experiment", "experimentid", "simulation", "sim", "case",
     ),
     "types": ("type", "types", "particletype", "material", "materialid", "phase", "species", "kind", "class"),
+    "active": USUAL_NAMES["active"],
 }  # fmt: skip
 """Names of columns by what they mean, in lower case without separators and units."""
 
@@ -53,6 +74,7 @@ class Columns:
     track: str
     run: str | None
     types: str | None
+    active: str | None
     position: tuple[str, ...]
     velocity: tuple[str, ...]
 
@@ -64,7 +86,7 @@ class Columns:
     @property
     def others(self) -> list[str]:
         """Columns without a meaning."""
-        used = {self.frame, self.time, self.track, self.run, self.types, *self.position, *self.velocity}
+        used = {self.frame, self.time, self.track, self.run, self.types, self.active, *self.position, *self.velocity}
         return [name for name in self.names if name not in used]
 
 
@@ -129,19 +151,21 @@ class Tracks(RunFiles):
         for index, chunks in enumerate(_split_runs(read_chunks(run.file, wanted), columns.run)):
             if index == run.index:
                 values = join_chunks(chunks)[columns.key]
-                return frame_numbers(values[~np.isnan(values)])[1] if values.dtype.kind == "f" else 0
+                times = as_times(values, f"{run.file}: the column {columns.key}")
+                return frame_numbers(times[~np.isnan(times)])[1]
         raise DataError(f"{run.file}: it has no run {run.index}.")
 
     def facts(self, file: Path) -> Facts:
         columns = table_columns(file)
-        dim, z = len(columns.position), columns.position[2:]
-        flat = dim == 3 and all((chunk[z[0]] == 0).all() for chunk in read_chunks(file, z))
+        constant = _constant_axis(file, columns.position)
         names = _type_names(file, columns.types) if columns.types else []
         shown = f"{columns.key}, {columns.track}, {', '.join(columns.position)}"
         fields = f"; as fields, where they are numbers: {', '.join(columns.others)}" if columns.others else ""
-        metadata = placeholder_metadata(dim - flat, particle_types=dict(enumerate(names)))
+        extra = {CONSTANT: constant} if constant else {}
+        dim = len(columns.position) - len(constant)
+        metadata = placeholder_metadata(dim, particle_types=dict(enumerate(names)), extra=extra)
         unknown = EVERYTHING_UNKNOWN - ({"particle_types"} if names else set())
-        return metadata, unknown, (f"Columns: {shown}{fields}.", *((FLAT,) if flat else ()))
+        return metadata, unknown, (f"Columns: {shown}{fields}.", *plane_notes(constant))
 
     def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:
         columns = table_columns(file)
@@ -164,15 +188,14 @@ def _may_be_table(file: Path) -> bool:
 
 def track_rows(table: Chunk, columns: Columns, metadata: Metadata, where: str, first_row: int) -> TrackRows:
     """The rows of a run; those without an id or position are left out, the first with a warning."""
-    key, time = table[columns.key], None if columns.time is None else table[columns.time]
-    position = np.stack([table[name] for name in columns.position], axis=-1)
-    for name, values in ((columns.key, key), (columns.time, time), (", ".join(columns.position), position)):
-        if values is not None and values.dtype.kind != "f":
-            raise DataError(f"{where}: the column {name} must contain numbers.")
-    position = drop_axes(position, metadata.dim, where)
+    key = as_times(table[columns.key], f"{where}: the column {columns.key}")
+    time = None if columns.time is None else as_times(table[columns.time], f"{where}: the column {columns.time}")
+    position = np.stack([as_numbers(table[name], f"{where}: the column {name}") for name in columns.position], axis=-1)
+    constant = metadata.extra.get(CONSTANT, {})
+    position = in_plane(position, metadata.dim, constant, where)
     track = table[columns.track]
     unlinked = np.isnan(track) if track.dtype.kind == "f" else track == ""
-    keep = ~(unlinked | np.isnan(key) | np.isnan(position).any(axis=1))
+    keep = ~(unlinked | np.isnan(key) | np.isnan(position).any(axis=1)) & _active(table, columns, where)
     if unlinked.any():
         _log.warning("%s: %s without %s left out.", where, counted(int(unlinked.sum()), "row"), columns.track)
     if not keep.any():
@@ -182,7 +205,7 @@ def track_rows(table: Chunk, columns: Columns, metadata: Metadata, where: str, f
         types = np.nan_to_num(types).astype(np.int64)
     else:
         types = type_ids(types, {name: i for i, name in metadata.particle_types.items()}, where)
-    velocity = columns.velocity[: metadata.dim]
+    velocity = drop_axis(np.array(columns.velocity), constant).tolist() if columns.velocity else []
     return TrackRows(
         first_row + np.flatnonzero(keep),
         position[keep],
@@ -193,6 +216,16 @@ def track_rows(table: Chunk, columns: Columns, metadata: Metadata, where: str, f
         {name: table[name][keep] for name in columns.others if table[name].dtype.kind == "f"},
         np.stack([table[name][keep] for name in velocity], axis=-1) if velocity else None,
     )
+
+
+def _active(table: Chunk, columns: Columns, where: str) -> np.ndarray:
+    """(n,) bool, which rows are of particles that are there."""
+    if columns.active is None:
+        return np.ones(len(table[columns.key]), bool)
+    active = as_numbers(table[columns.active], f"{where}: the column {columns.active}")
+    if not np.isin(active, (0, 1)).all():
+        raise DataError(f"{where}: {columns.active} must be 0 where a particle is absent, and 1 elsewhere.")
+    return np.asarray(active == 1)
 
 
 def _split_runs(chunks: Iterable[Chunk], column: str | None) -> Iterator[list[Chunk]]:
@@ -211,6 +244,16 @@ def _split_runs(chunks: Iterable[Chunk], column: str | None) -> Iterator[list[Ch
             pending.append({name: values[low:high] for name, values in chunk.items()})
     if pending:
         yield pending
+
+
+def _constant_axis(file: Path, names: Sequence[str]) -> dict[str, float]:
+    """The constant axis of a table's coordinates, of which the extremes of all chunks tell."""
+    ends = [np.zeros((0, len(names)))]
+    for chunk in read_chunks(file, names) if len(names) == len(AXES) else ():
+        if all(chunk[name].dtype.kind == "f" for name in names):
+            position = np.stack([chunk[name] for name in names], axis=-1)
+            ends += [np.fmin.reduce(position)[None], np.fmax.reduce(position)[None]]
+    return constant_axis(np.concatenate(ends))
 
 
 def _type_names(file: Path, column: str) -> list[str]:

@@ -141,7 +141,7 @@ def test_short_tracks_share_slots(tmp_path):
     [
         ([*lines(made()), "3,2,0.5,0.5"], r"rows \d+ and 41 are both track 2 in frame 3"),
         ([*lines(made()), "3,2,0.5"], r"a\.csv, line 42: it has 3 cells, the header has 4"),
-        ([*lines(made()), "3,2,a,0.5"], r"the column x, y must contain numbers"),
+        ([*lines(made()), "3,2,a,0.5"], r"the column x must contain numbers, but has 'a'"),
         (lines(made(), "frame,name,x,y"), r"no column id \(columns: frame, name, x, y\)"),
     ],
     ids=["twice", "cells", "text", "id"],
@@ -173,3 +173,44 @@ def test_tables_of_pandas_and_of_track_mate_are_read(tmp_path):
     np.testing.assert_allclose(read(write(tmp_path / "mate.csv", labelled)).position, made(), atol=1e-6)
     quoted = [header, *(",".join(f'"{cell}"' for cell in row.split(",")) for row in rows)]
     np.testing.assert_allclose(read(write(tmp_path / "quoted.csv", quoted)).position, made(), atol=1e-6)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be"])
+@pytest.mark.parametrize("name", ["a.csv", "a.csv.gz"])
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_tables_as_spreadsheets_save_them(tmp_path, encoding, name, separator):
+    position = made()
+    table = "\r\n".join(["sep=" + separator, *(row.replace(",", separator) for row in lines(position))])
+    content = table.replace(".", ",").encode(encoding)
+    (tmp_path / name).write_bytes(gzip.compress(content) if name.endswith(".gz") else content)
+    np.testing.assert_allclose(read(tmp_path / name).position, position, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.parquet", "folder"])
+@pytest.mark.parametrize("zone", ["", "Z", "+02:00"])
+def test_dates_are_seconds_since_the_first(tmp_path, name, zone):
+    position, moments = made(), [f"2026-05-31 23:59:59.{9 - 1:01d}{frame:02d}{zone}" for frame in range(FRAMES)]
+    rows = [row.split(",") for row in lines(position)[1:]]
+    if name == "folder":
+        for frame in range(FRAMES):
+            inside = [",".join([moments[frame], *row[1:]]) for row in rows if int(row[0]) == frame]
+            path = write(tmp_path / name / f"f_{frame}.csv", ["time,particle,x,y", *inside]).parent
+    else:
+        path = write(tmp_path / "a.csv", ["time,particle,x,y", *(",".join([moments[int(r[0])], *r[1:]]) for r in rows)])
+    if name == "a.parquet":
+        table, parquet = pytest.importorskip("pyarrow.csv"), pytest.importorskip("pyarrow.parquet")
+        parquet.write_table(table.read_csv(path), tmp_path / name)
+        path = tmp_path / name
+    run = read(path)
+    np.testing.assert_allclose(run.fields["time"], np.arange(FRAMES) / 1000, atol=1e-12)
+    np.testing.assert_allclose(run.position, position, atol=1e-6)
+
+
+def test_other_dates_and_commas_are_refused_with_the_mend(tmp_path):
+    rows = ["time,id,x,y", "31.05.2026 12:00,1,0.5,0.5"]
+    with pytest.raises(DataError, match=r"column time must contain numbers, or dates such as 2026-05-31T12.*'31\.05\."):
+        read(write(tmp_path / "a.csv", rows))
+    with pytest.raises(DataError, match=r"line 2: it has 6 cells, the header has 4. If commas are decimal, separate"):
+        read(write(tmp_path / "b.csv", ["frame,id,x,y", "0,1,0,5,0,25"]))
+    with pytest.raises(DataError, match=r"the column x must contain numbers, but has 'left'"):
+        read(write(tmp_path / "c.csv", ["frame,id,x,y", "0,1,left,0.25"]))
