@@ -17,6 +17,7 @@ from nmpm._support.atomic import lock_folder
 from nmpm._support.shipped import user_home
 from nmpm._support.version import __version__
 from nmpm.data.convert.array_files import ArrayFiles
+from nmpm.data.convert.array_frames import ArrayFrames
 from nmpm.data.convert.base import DatasetFormat as DatasetFormat
 from nmpm.data.convert.base import ForeignDataset as ForeignDataset
 from nmpm.data.convert.base import Options as Options
@@ -55,6 +56,7 @@ FORMATS: tuple[DatasetFormat, ...] = (
     RolloutPickle(),
     NativeFiles(),
     ArrayFiles(),
+    ArrayFrames(),
     CsvFrames(),
     Tracks(),
     Vtk(),

@@ -39,7 +39,8 @@ class ArrayFiles(RunFiles):
 
     def recognises(self, path: Path) -> bool:
         first = next(iter(self.files(path).values()), ())
-        return bool(first) and bool(self.runs(first[0]))
+        runs = self.runs(first[0]) if first else ()
+        return bool(runs) and ([run.frames for run in runs] != [1] or path.is_file())
 
     def files(self, path: Path) -> dict[str, tuple[Path, ...]]:
         if is_array_folder(path):

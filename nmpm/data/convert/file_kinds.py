@@ -85,6 +85,11 @@ def is_other_folder(folder: Path) -> bool:
     return bool(words(folder.name)) and words(folder.name) <= _OTHER_WORDS | _WALL_WORDS | {"bodies"}
 
 
+def is_other_name(name: str) -> bool:
+    """Whether a word of a name is one of grids, surfaces and the like."""
+    return bool(words(name) & _OTHER_WORDS)
+
+
 def material_names(kinds: Iterable[str]) -> dict[str, str]:
     """Names of materials by kinds: what tells their names from each other; all walls are called so."""
     kinds = list(kinds)

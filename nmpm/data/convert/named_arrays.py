@@ -40,10 +40,11 @@ USUAL_NAMES: Mapping[str, tuple[str, ...]] = {
         "isvalid", "validity", "activemask", "validmask", "particlemask",
     ),
     "id": (
-        "id", "ids", "particle", "particleid", "particleids", "pid", "idp", "uid", "tag", "track", "trackid",
+        "id", "ids", "particle", "particleid", "particleids", "pid", "idp", "uid", "tag", "track", "trackid", "gid",
         "globalid", "globalids",
     ),
-    "time": ("time", "times", "timestamps", "t"),
+    "time": ("time", "times", "timestamps", "t", "tcurrent", "currenttime", "simulationtime", "timevalue"),
+    "step": ("step", "timestepnumber", "iteration", "count"),
     "dt": ("dt", "deltat", "framedt", "timestep", "frameinterval"),
     "gravity": ("gravity", "grav", "g"),
     "bounds": ("bounds", "box", "boundingbox", "bbox", "domain", "limits"),

@@ -119,7 +119,7 @@ def _wrong_positions(arrays: Arrays) -> str | None:
         if len(shape) in (3, 4) and small:
             return f"{problem}, the axes of space last: np.moveaxis({name.split('/')[-1]}, {small[-1]}, -1)."
         if len(shape) == 2 and shape[1] in (2, 3):
-            return f"{problem}: this is one frame. Stack the frames: np.stack(frames)."
+            return f"{problem}: this is one frame. Give the folder of the frames, or stack them: np.stack(frames)."
         return f"{problem}: frames, particles, 1 to 3 axes."
     return None
 
