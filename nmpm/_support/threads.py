@@ -9,11 +9,12 @@ with whatever comes next. So a `Task` is waited for, and long work calls `raise_
 
 from __future__ import annotations
 
+import math
 import os
-import statistics
 import threading
 import time
-from collections.abc import Callable, Mapping, MutableMapping
+from collections import deque
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import ContextVar, copy_context
 from typing import Generic, TypeVar
@@ -29,12 +30,19 @@ SPIN_COUNT = 1000
 
 SKIPPED = 2
 """First calls, in which kernels are compiled, that are not measured."""
-TRIALS = 3
-"""Calls by which a number of threads is judged, fewer if the first takes `HOPELESS` times as long as the others'."""
-HOPELESS = 3.0
+PAIRS = 5
+"""Calls by which each number of threads is judged, in turn; `HOPELESS_PAIRS` if one takes `HOPELESS` times as long."""
+HOPELESS, HOPELESS_PAIRS = 3.0, 3
+QUANTILE = 0.25
+"""Of these calls' times, by which numbers of threads are compared: what other programs disturb is slower."""
+MARGIN = 0.95
+"""The number in use stays unless the other takes less than this share of its time."""
 LOOK_AGAIN = 30.0
-"""Seconds from one measurement to the next, or `LOOK_AGAIN_SHARE` times what it took."""
-LOOK_AGAIN_SHARE = 50
+"""Seconds from one measurement to the next, or `LOOK_AGAIN_SHARE` times those that the slower number has cost."""
+LOOK_AGAIN_SHARE = 25
+CHANGED, CHANGED_CALLS, SOON_SHARE = 1.25, 5, 10
+"""So many calls in a row this much slower or faster than measured mean another load: measure again, if the last
+measurement is `SOON_SHARE` times as long ago as it has cost."""
 
 
 def usable_cores() -> int:
@@ -91,18 +99,19 @@ class ThreadChoice:
     Attributes:
         most: All threads.
         threads: How many the next call gets.
-        medians: Seconds of a call by number of threads, as last measured; empty before.
+        seconds: Of an undisturbed call by number of threads, as last measured; empty before.
     """
 
     def __init__(
         self, stated: int | None, apply: Callable[[int], object], clock: Callable[[], float] = time.perf_counter
     ) -> None:
-        self.most = self.threads = stated or usable_cores()
+        self.most = self.threads = self._chosen = stated or usable_cores()
         self._candidates = [self.most] if stated or self.most == 1 else [self.most, 1]
         self._apply, self._clock = apply, clock
         self._calls, self._times = 0, dict[int, list[float]]()
-        self._since, self._next_look = 0.0, -1.0
-        self.medians: dict[int, float] = {}
+        self._recent: deque[float] = deque(maxlen=CHANGED_CALLS)
+        self._since, self._next_look, self._soonest = 0.0, -math.inf, -math.inf
+        self.seconds: dict[int, float] = {}
 
     def __str__(self) -> str:
         if len(self._candidates) == 1:
@@ -118,23 +127,50 @@ class ThreadChoice:
         """End a call, and choose the number of threads of the next."""
         now = self._clock()
         self._calls += 1
-        if len(self._candidates) == 1 or self._calls <= SKIPPED or now < self._next_look:
+        if len(self._candidates) == 1 or self._calls <= SKIPPED:
+            return
+        if now < self._next_look:
+            self._recent.append(now - self._since)
+            if self._has_changed() and now >= self._soonest:
+                self._next_look = now
             return
         self._times.setdefault(self.threads, []).append(now - self._since)
-        untried = [threads for threads in self._candidates if not self._judged(threads)]
-        if untried:
-            self.threads = untried[0]
-            return
-        self.medians = {threads: statistics.median(times) for threads, times in self._times.items()}
-        self.threads = min(self.medians, key=self.medians.__getitem__)
-        self._next_look = now + max(LOOK_AGAIN, LOOK_AGAIN_SHARE * sum(map(sum, self._times.values())))
-        self._times = {}
+        if self._is_judged():
+            self._choose(now)
+        else:
+            self.threads = min(self._candidates, key=lambda threads: len(self._times.get(threads, [])))
 
-    def _judged(self, threads: int) -> bool:
-        """Whether a number of threads was measured often enough."""
-        mine = self._times.get(threads, [])
-        others = [seconds for other, times in self._times.items() if other != threads for seconds in times]
-        return len(mine) >= TRIALS or bool(mine and others and min(mine) > HOPELESS * max(others))
+    def _has_changed(self) -> bool:
+        """Whether recent calls all were slower, or all faster, than measured."""
+        if len(self._recent) < CHANGED_CALLS:
+            return False
+        expected = self.seconds[self.threads]
+        return min(self._recent) > CHANGED * expected or CHANGED * max(self._recent) < expected
+
+    def _is_judged(self) -> bool:
+        """Whether all numbers of threads were measured often enough."""
+        times = [self._times.get(threads, []) for threads in self._candidates]
+        least = min(map(len, times))
+        hopeless = least >= HOPELESS_PAIRS and max(map(min, times)) > HOPELESS * min(map(max, times))
+        return least >= PAIRS or hopeless
+
+    def _choose(self, now: float) -> None:
+        self.seconds = {threads: _lower_quantile(times) for threads, times in self._times.items()}
+        fastest = min(self.seconds, key=self.seconds.__getitem__)
+        if self.seconds[fastest] < MARGIN * self.seconds[self._chosen]:
+            self._chosen = fastest
+        self.threads, best = self._chosen, self.seconds[self._chosen]
+        cost = sum(
+            max(0.0, seconds - best) for n, times in self._times.items() if n != self.threads for seconds in times
+        )
+        self._next_look = now + max(LOOK_AGAIN, LOOK_AGAIN_SHARE * cost)
+        self._soonest = now + SOON_SHARE * cost
+        self._times = {}
+        self._recent.clear()
+
+
+def _lower_quantile(values: Sequence[float]) -> float:
+    return sorted(values)[int(QUANTILE * len(values))]
 
 
 _POLL_SECONDS = 0.05

@@ -75,9 +75,9 @@ class Threads(Callback):
         if self._module is None:
             return
         self.choice.stop()
-        if self.choice.medians and not self._printed:
+        if self.choice.seconds and not self._printed:
             self._printed = True
-            times = "; ".join(f"{1e3 * seconds:.0f} ms by {n}" for n, seconds in self.choice.medians.items())
+            times = "; ".join(f"{1e3 * seconds:.0f} ms by {n}" for n, seconds in self.choice.seconds.items())
             self._module.print(f"Threads: {self.choice.threads} (a step takes {times}).")
 
     def _apply(self, threads: int) -> None:
