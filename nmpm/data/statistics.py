@@ -190,11 +190,22 @@ def first_outside(
 
     Outside are positions beyond walls. Only particles that are `counted`, (N,), are compared.
     """
+    if _all_within(position, domain, boundary):
+        return None
     outside = are_outside(position, domain, boundary) & counted
     if not outside.any():
         return None
     frame, particle = map(int, np.argwhere(outside)[0])
     return frame, particle, int(outside.any(axis=0).sum())
+
+
+def _all_within(position: np.ndarray, domain: Sequence[Interval], boundary: Sequence[Boundary]) -> bool:
+    """Whether no position is beyond walls or NaN: quicker than `are_outside`, and the usual case."""
+    ends = zip(np.asarray(domain, dtype=np.float32), boundary, strict=True)
+    return position.size > 0 and all(
+        kind != "wall" or bool(position[..., axis].min() >= low and position[..., axis].max() <= high)
+        for axis, ((low, high), kind) in enumerate(ends)
+    )
 
 
 def first_moving_particle(position: np.ndarray, particles: np.ndarray, extent: Sequence[Interval]) -> int | None:

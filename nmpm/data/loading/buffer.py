@@ -59,7 +59,8 @@ class MotionSampler:
 def _window_distances(recording: Recording, scene: Scene, length: int) -> np.ndarray:
     """Mean distance that a particle travels within each window of `length` frames, (windows,)."""
     steps = displacements(recording.frames, scene).numpy()
-    speed = _mean_over_present(np.linalg.norm(steps, axis=-1), recording.present)
+    squares = (np.square(steps[..., axis]) for axis in range(steps.shape[-1]))
+    speed = _mean_over_present(np.sqrt(sum(squares)), recording.present)  # (`np.linalg.norm` takes four times as long)
     total = np.concatenate([[0.0], np.cumsum(speed)])
     return np.asarray(total[length - 1 :] - total[: len(total) - length + 1])
 

@@ -79,7 +79,7 @@ class RecordingReader:
         moving, obstacle = self.check(trajectory, where)
         self._check_rest(trajectory, where)
         gravity = trajectory_gravity(trajectory.attributes, self.scene, where) or (0.0,) * self.scene.dim
-        position = trajectory.position[:, moving]
+        position = trajectory.position if moving.all() else trajectory.position[:, moving]
         check_end(position, where)
         position = without_those_gone(position, self.scene)
         presence = Presence.of(position)
