@@ -27,6 +27,8 @@ from nmpm.data.convert.deepmind import DeepMind
 from nmpm.data.convert.dmcf import Dmcf
 from nmpm.data.convert.frame_files import FrameFormat
 from nmpm.data.convert.gns_npz import GnsNpz
+from nmpm.data.convert.gsd import Gsd
+from nmpm.data.convert.h5md import H5md
 from nmpm.data.convert.lammps import Lammps
 from nmpm.data.convert.native import Native, NativeFiles
 from nmpm.data.convert.nearest import describe_several, describe_unknown, has_splits, subfolders
@@ -55,6 +57,7 @@ FORMATS: tuple[DatasetFormat, ...] = (
     Dmcf(),
     RolloutPickle(),
     NativeFiles(),
+    H5md(),
     ArrayFiles(),
     ArrayFrames(),
     CsvFrames(),
@@ -64,6 +67,7 @@ FORMATS: tuple[DatasetFormat, ...] = (
     Ply(),
     Lammps(),
     Xyz(),
+    Gsd(),
 )
 
 

@@ -34,7 +34,7 @@ HINTS: Mapping[str, str] = {
         (".zarr", f"read it by zarr.open and write positions (T, N, D) by {_WRITE}"),
         (".xlsx", "save it as .csv: a row for each particle in each frame, with frame, id, x, y"),
         (".feather", "write it as .parquet: a row for each particle in each frame, with frame, id, x, y"),
-        (".xtc .trr .dcd .gsd .pdb", "MDAnalysis, ase or OVITO write it as .xyz or as a LAMMPS dump, which are read"),
+        (".xtc .trr .dcd .pdb", "MDAnalysis, ase or OVITO write it as .xyz or as a LAMMPS dump, which are read"),
         (
             ".bgeo .sc .abc .usd .usda .usdc .obj",
             "Houdini or Blender write it as a .ply file per frame, which are read",
