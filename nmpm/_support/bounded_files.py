@@ -84,6 +84,12 @@ def check_regular(path: Path) -> None:
         raise DataError(f"{path} cannot be read: {reason}.")
 
 
+def check_within(path: Path, other: Path) -> None:
+    """Refuses, with a DataError, another file that a file names and that is not in its folder or a folder there."""
+    if not other.resolve().is_relative_to(path.parent.resolve()):
+        raise DataError(f"{path}: it names {one_line(other)}, which is not in its folder. Copy it there.")
+
+
 def read_bounded(path: Path, limit: int) -> bytes:
     """The content of a regular file of at most `limit` bytes.
 

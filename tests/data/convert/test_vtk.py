@@ -112,7 +112,7 @@ def test_damaged_files_are_named(tmp_path, capfd, suffix, damage, message, frame
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (["../other.vtp"], "lists .*other.vtp, which is not in its folder"),
+        (["../other.vtp"], "names .*other.vtp, which is not in its folder"),
         (["frame_0.vtp", "frame_9.vtp"], "frame_9.vtp cannot be read: No such file"),
         ([], "it lists no file"),
     ],
@@ -122,6 +122,63 @@ def test_wrong_lists(tmp_path, names, message):
     write_run(tmp_path / "run")
     with pytest.raises(DataError, match=message):
         convert(write_list(tmp_path / "run", names, list(range(len(names)))), tmp_path / "out")
+
+
+POINTS = (
+    '<VTKFile type="PolyData" version="0.1"><PolyData><Piece NumberOfPoints="3"><Points><DataArray type="Float32"'
+    ' NumberOfComponents="3" format="ascii">0 0 0 1 0 0 0 1 0</DataArray></Points></Piece></PolyData></VTKFile>'
+)
+
+
+def write_parts(folder: Path, source: str) -> Path:
+    (folder / "data" / "parts").mkdir(parents=True)
+    for place in (folder / "secret.vtp", folder / "data" / "parts" / "part.vtp"):
+        place.write_text(POINTS)
+    points = '<PPoints><PDataArray type="Float32" NumberOfComponents="3"/></PPoints>'
+    text = f'<VTKFile type="PPolyData" version="0.1"><PPolyData>{points}<Piece Source={source}/></PPolyData></VTKFile>'
+    for frame in range(3):
+        (folder / "data" / f"frame_{frame}.vtp").write_text(text)
+    return folder / "data"
+
+
+def test_parts_in_the_folder_are_read(tmp_path):
+    convert(write_parts(tmp_path, '"parts/part.vtp"'), tmp_path / "out")
+    assert Split(tmp_path / "out" / "train.h5").read(0).position.shape == (3, 3, 2)
+
+
+@pytest.mark.parametrize(
+    "source", ['"../secret.vtp"', "'../secret.vtp'", '"parts/../../secret.vtp"', '"&#46;./secret.vtp"']
+)
+def test_parts_elsewhere_are_not_read(tmp_path, source):
+    with pytest.raises(DataError, match=r"frame_0\.vtp: it names .*secret.vtp, which is not in its folder"):
+        convert(write_parts(tmp_path, source), tmp_path / "out")
+    frame, part = tmp_path / "data" / "frame_0.vtp", tmp_path / "data" / "parts" / "part.vtp"
+    part.write_text(frame.read_text())
+    frame.write_text(frame.read_text().replace(source, '"parts/part.vtp"'))
+    with pytest.raises(DataError, match=r"part\.vtp.* not in its folder|names parts itself"):
+        convert(tmp_path / "data", tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("text", "other"),
+    [
+        ('NumberOfPoints="3"', "NumberOfPoints='2000000000'"),
+        ('NumberOfPoints="3"', "NumberOfPoints = \n '  +2000000000 '"),
+        ('NumberOfPoints="3"', 'NumberOfPoints="&#50;000000000"'),
+        ('<Piece NumberOfPoints="3"', f'<!--{"x" * 10**6}--><Piece NumberOfPoints="2000000000"'),
+        ('NumberOfComponents="3"', "NumberOfComponents='900000000'"),
+        ('NumberOfPoints="3"', "NumberOfPoints='40000000'"),
+        ('<VTKFile type="PolyData"', '<!DOCTYPE VTKFile [<!ENTITY n "2000000000">]><VTKFile type="PolyData"'),
+        ('type="PolyData"', 'type="vtkMultiBlockDataSet"'),
+    ],
+    ids=["quotes", "blanks", "entity", "comment", "components", "product", "doctype", "kind"],
+)
+def test_sizes_are_checked_in_every_spelling_of_xml(tmp_path, text, other):
+    (tmp_path / "run").mkdir()
+    for frame in range(3):
+        (tmp_path / "run" / f"frame_{frame}.vtp").write_text(POINTS.replace(text, other))
+    with pytest.raises(DataError, match=r"frame_0\.vtp: (it declares|it has a vtkMulti|.*document type)"):
+        convert(tmp_path / "run", tmp_path / "out")
 
 
 def test_a_missing_library_gives_the_install_command(tmp_path, monkeypatch):

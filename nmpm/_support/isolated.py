@@ -1,0 +1,241 @@
+"""Runs native parsers in child processes with a memory limit: their crash is one error, and this process goes on.
+
+A child serves one call after the other, so that starting it and importing the parser cost once. It ends when it has had
+no call for some seconds, or with its parent. It executes functions of this package only, and returns plain data and
+arrays of numbers and texts, nothing pickled.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+
+from nmpm import errors
+from nmpm._support.bounded_files import expansion_limit
+from nmpm._support.memory import free_memory
+from nmpm._support.messages import one_line
+from nmpm.errors import DataError, NmpmError
+
+_COPIES = 3
+"""Of a file's unpacked content, in the parser, in arrays, and on their way."""
+_OWN_BYTES = 2**28
+"""For the parser's libraries."""
+_IDLE_SECONDS = 10.0
+_PIPE_BYTES = 2**20
+_START = "from nmpm._support.isolated import serve; serve()"
+_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+"""Threads, which a parser does not need, would count as memory."""
+
+
+def call_isolated(function: Callable[..., Any], path: Path, *arguments: Any) -> Any:
+    """What `function(path, *arguments)` returns, computed in a child process.
+
+    Args:
+        function: Of a module that is cheap to import; returns numbers, texts, None, arrays, and lists and mappings of
+            these.
+        path: The file that it reads.
+        arguments: Numbers, texts, and lists of them.
+
+    Raises:
+        DataError: if the file needs more memory than its size allows, or the child ends.
+        NmpmError: as the function does.
+    """
+    (value,) = iterate_isolated(function, path, *arguments)
+    return value
+
+
+def iterate_isolated(function: Callable[..., Any], path: Path, *arguments: Any) -> Iterator[Any]:
+    """Yields what `function(path, *arguments)` yields, as far as it is asked for; else as `call_isolated`."""
+    limit = int(min(_OWN_BYTES + _COPIES * expansion_limit(path.stat().st_size), free_memory()))
+    request = [f"{function.__module__}:{function.__name__}", str(path), list(arguments), limit]
+    idle = _idle_children(os.getpid())
+    child = idle.pop() if idle else _Child()
+    while not child.send(request):  # it has ended, as it was idle
+        child = _Child()
+    waits = False  # for the next call
+    try:
+        while True:
+            kind, content = child.receive(path)
+            waits = kind == "end"
+            if waits:
+                return
+            waits = kind == "value"
+            yield content
+            if waits:
+                return
+            child.send("next")
+    except GeneratorExit:
+        waits = waits or (child.send("stop") and child.receive(path)[0] == "end")
+        raise
+    except NmpmError:
+        waits = child.process.poll() is None
+        raise
+    finally:
+        if waits:
+            idle.append(child)
+        else:
+            child.end()
+
+
+@cache
+def _idle_children(process: int) -> list[_Child]:  # noqa: ARG001 (a forked process does not share its parent's)
+    return []
+
+
+class _Child:
+    """A child process, started."""
+
+    def __init__(self) -> None:
+        known = os.pathsep.join(path for path in sys.path if path)
+        process = subprocess.Popen(  # noqa: S603 (this interpreter)
+            [sys.executable, "-P", "-c", _START],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=os.environ | _ENVIRONMENT | {"PYTHONPATH": known},
+            pipesize=_PIPE_BYTES,
+            start_new_session=True,  # Ctrl-C is its parent's
+        )
+        self.process, self._requests, self._answers = process, cast(BinaryIO, process.stdin), cast(Any, process.stdout)
+
+    def send(self, message: Any) -> bool:
+        """Send a line; False if the process has ended."""
+        try:
+            self._requests.write(json.dumps(message).encode() + b"\n")
+            self._requests.flush()
+        except OSError:
+            self.end()
+            return False
+        return self.process.poll() is None
+
+    def receive(self, path: Path) -> tuple[str, Any]:
+        """The next answer: an "item" that the function yielded, its "end", or the "value" that it returned.
+
+        Raises:
+            NmpmError: that the function raised.
+            DataError: if the process ended.
+        """
+        try:
+            kind, content = _read_message(self._answers)
+        except (OSError, EOFError, ValueError) as error:
+            raise DataError(f"{path}: cannot be read: {self._how_it_ended()} Is it complete? Copy it again.") from error
+        if kind in ("item", "end", "value"):
+            return kind, content
+        raise getattr(errors, kind)(content)
+
+    def _how_it_ended(self) -> str:
+        status = self.process.wait()
+        name = signal.Signals(-status).name if status < 0 else f"status {status}"
+        return f"its parser ended ({name}): it is damaged, or asks for more memory than its size allows."
+
+    def end(self) -> None:
+        """End the process."""
+        with suppress(OSError):
+            self.process.kill()
+        for stream in (self._requests, self._answers):
+            with suppress(OSError):
+                stream.close()
+        self.process.wait()
+
+
+def serve() -> None:
+    """Run the calls that come by standard input; answer by standard output, which parsers cannot write to."""
+    requests = os.fdopen(os.dup(0), "rb", buffering=0)
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    with suppress(BrokenPipeError):
+        while line := _next_request(requests):
+            _answer(json.loads(line), requests, answers)
+
+
+def _next_request(requests: BinaryIO) -> bytes:
+    """A line; empty at the end, or after some seconds without one."""
+    if os.name == "posix":
+        import select
+
+        if not select.select([requests], [], [], _IDLE_SECONDS)[0]:
+            return b""
+    return requests.readline()
+
+
+def _answer(request: tuple[str, str, list[Any], int], requests: BinaryIO, answers: BinaryIO) -> None:
+    name, path, arguments, limit = request
+    module, _, function = name.partition(":")
+    try:
+        _limit_memory(limit)
+        result = getattr(import_module(module), function)(Path(path), *arguments)
+        if not isinstance(result, Iterator):
+            _write_message(answers, "value", result)
+            return
+        for item in result:
+            _write_message(answers, "item", item)
+            if json.loads(requests.readline() or '"stop"') == "stop":
+                break
+    except NmpmError as error:
+        _write_message(answers, type(error).__name__, str(error))
+    except Exception as error:  # damaged files may make a parser raise anything
+        reason = one_line(error, 300) or type(error).__name__
+        _write_message(answers, "DataError", f"{path}: cannot be read ({reason}). Is it complete? Copy it again.")
+    else:
+        _write_message(answers, "end", None)
+
+
+def _limit_memory(extra: int) -> None:
+    """Limit this process to so many bytes more than it has, where the system can."""
+    try:
+        import resource
+
+        used = re.search(r"VmData:\s+(\d+)", Path("/proc/self/status").read_text())
+        _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        if used is not None:
+            limit = 1024 * int(used[1]) + extra
+            resource.setrlimit(resource.RLIMIT_DATA, (limit if hard < 0 else min(limit, hard), hard))
+    except (ImportError, OSError, ValueError):
+        return
+
+
+def _write_message(stream: BinaryIO, kind: str, content: Any) -> None:
+    """A line of JSON that has kind and shape in place of arrays, and then their numbers."""
+    arrays: list[np.ndarray] = []
+
+    def describe(array: np.ndarray) -> dict[str, Any]:
+        arrays.append(np.ascontiguousarray(array))
+        return {"dtype": arrays[-1].dtype.str, "shape": array.shape}
+
+    stream.write(json.dumps([kind, content], default=describe).encode() + b"\n")
+    for array in arrays:
+        stream.write(array.reshape(-1).view(np.uint8).data if array.size else b"")
+    stream.flush()
+
+
+def _read_message(stream: Any) -> tuple[str, Any]:
+    def read(item: dict[str, Any]) -> Any:
+        if set(item) != {"dtype", "shape"}:
+            return item
+        dtype = np.dtype(item["dtype"])
+        if dtype.kind not in "biufSU":
+            raise ValueError("neither numbers nor texts")
+        array = np.empty(item["shape"], dtype)
+        octets = array.reshape(-1).view(np.uint8).data if array.size else memoryview(b"")
+        if array.size and stream.readinto(octets) != len(octets):
+            raise EOFError
+        return array
+
+    line = stream.readline()
+    if not line.endswith(b"\n"):
+        raise EOFError
+    kind, content = json.loads(line, object_hook=read)
+    return kind, content
