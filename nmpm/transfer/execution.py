@@ -68,8 +68,8 @@ def by_torch_scatter(source: Tensor, index: Tensor, size: int) -> Tensor:
         import torch_scatter
     except (ImportError, OSError) as error:
         raise ConfigError(
-            "The backend torch-scatter needs the package, compiled for this torch: pip install setuptools hatchling && "
-            f'pip install --no-build-isolation -e ".[scatter]" ({error}).'
+            "The backend torch-scatter needs the package, compiled for this torch: pip install setuptools hatchling "
+            f'editables && pip install --no-build-isolation -e ".[scatter]" ({error}).'
         ) from error
     summed: Tensor = torch_scatter.scatter(source, index, dim=1, dim_size=size, reduce="sum")
     return summed
