@@ -11,19 +11,98 @@ import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, Self, TypeVar, get_args
 
 from nmpm._support.plain_data import from_plain, to_plain
 from nmpm.errors import ConfigError
 
 Boundary = Literal["wall", "periodic", "open"]
 Interval = tuple[float, float]
+T = TypeVar("T")
 
 _RESERVED = frozenset({"position", "particle_type", "velocity", "volume", "solid", "gravity"})
 
 
 _SAME = 1e-6
 """Share of a domain's extent by which the ends of a period may differ, as by rounding."""
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A permutation and mirroring of axes, such as ("x", "z", "-y"): y of the result is z, and z is -y.
+
+    Args:
+        axes: For each axis of the result the one that it is taken from, with a minus sign where it is mirrored.
+
+    Raises:
+        ConfigError: if these are not all axes of a scene, each once.
+    """
+
+    axes: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        names = sorted(axis.removeprefix("-") for axis in self.axes)
+        if not 1 <= len(names) <= 3 or names != list("xyz"[: len(names)]):
+            raise ConfigError(f"A turn names each axis once, such as ('x', 'z', '-y'); got {self.axes}.")
+
+    @property
+    def sources(self) -> tuple[int, ...]:
+        """For each axis of the result the index of the one that it is taken from."""
+        return tuple("xyz".index(axis[-1]) for axis in self.axes)
+
+    @property
+    def mirrored(self) -> tuple[bool, ...]:
+        """Whether each axis of the result is mirrored."""
+        return tuple(axis.startswith("-") for axis in self.axes)
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether each axis stays as it is."""
+        return "".join(self.axes) == "xyz"[: len(self.axes)]
+
+    @property
+    def inverse(self) -> Turn:
+        """The turn back."""
+        back = sorted(zip(self.sources, self.mirrored, "xyz", strict=False))
+        return Turn(tuple(f"-{axis}" if mirror else axis for _, mirror, axis in back))
+
+    def after(self, first: Turn) -> Turn:
+        """Both turns, this one last."""
+        axes = (f"-{first.axes[at]}" if mirror else first.axes[at] for at, mirror in self._pairs)
+        return Turn(tuple(axis.replace("--", "") for axis in axes))
+
+    def vector(self, values: Sequence[float]) -> tuple[float, ...]:
+        """A vector (D,) in the result's axes."""
+        return tuple((-values[at] or 0.0) if mirror else values[at] for at, mirror in self._pairs)
+
+    def intervals(self, sides: Sequence[Interval]) -> tuple[Interval, ...]:
+        """Lower and upper ends (D,) along the result's axes."""
+        pairs = ((sides[at], mirror) for at, mirror in self._pairs)
+        return tuple((-high or 0.0, -low or 0.0) if mirror else (low, high) for (low, high), mirror in pairs)
+
+    def permuted(self, values: Sequence[T]) -> tuple[T, ...]:
+        """Values of the axes, in the result's order."""
+        return tuple(values[at] for at in self.sources)
+
+    def channels(self, names: Sequence[str]) -> tuple[tuple[int, bool], ...]:
+        """For each channel of the result the index of the one that it is taken from, and whether its sign changes.
+
+        Channels whose names end with _x, _y (and _z) are the components of a vector; the others stay.
+        """
+        taken = []
+        for at, name in enumerate(names):
+            stem, axis = name[:-1], name[-1:]
+            parts = [f"{stem}{each}" for each in "xyz"[: len(self.axes)]]
+            if stem.endswith("_") and name in parts and set(parts) <= set(names):
+                source, mirror = self._pairs["xyz".index(axis)]
+                taken.append((names.index(parts[source]), mirror))
+            else:
+                taken.append((at, False))
+        return tuple(taken)
+
+    @property
+    def _pairs(self) -> tuple[tuple[int, bool], ...]:
+        return tuple(zip(self.sources, self.mirrored, strict=True))
 
 
 @dataclass(frozen=True)
@@ -208,6 +287,16 @@ class Scene:
         bounds = tuple((low + d, high + d) if wraps else (low, high) for (low, high), d, wraps in sides)
         return dataclasses.replace(self, bounds=bounds, domain=domain)
 
+    def turned(self, turn: Turn) -> Self:
+        """The same scene in the axes that a turn makes of its own."""
+        return dataclasses.replace(
+            self,
+            bounds=turn.intervals(self.bounds),
+            domain=turn.intervals(self.domain),
+            boundary=turn.permuted(self.boundary),
+            gravity=None if self.gravity is None else turn.vector(self.gravity),
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """The scene as plain lists, strings and numbers; without what is optional and absent."""
         plain = dataclasses.asdict(self)
@@ -274,6 +363,10 @@ class Motion:
     largest: float | None = None
     gravity: tuple[float, ...] | None = None
     frames: int | None = None
+
+    def turned(self, turn: Turn) -> Self:
+        """The same motion in the axes that a turn makes of its own."""
+        return self if self.gravity is None else dataclasses.replace(self, gravity=turn.vector(self.gravity))
 
 
 def is_same_volume(one: float, other: float) -> bool:

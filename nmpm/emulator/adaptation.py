@@ -17,9 +17,9 @@ from torch import Tensor
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.recipe import EmulatorRecipe
 from nmpm.errors import ConfigError
-from nmpm.processors import GridLayout, Stochastic
+from nmpm.processors import GridLayout, Stochastic, Turned
 from nmpm.processors.channels import ChannelChange, OutputSource
-from nmpm.scene import Scene
+from nmpm.scene import Scene, Turn
 
 _SOLID_STD = 0.25
 """Standard deviation of an added solid channel: that of walls and obstacles in a fifteenth of the cells."""
@@ -39,6 +39,9 @@ def adapted(emulator: Emulator, recipe: EmulatorRecipe) -> Emulator:
         ConfigError: if the processor, the number of frames or of axes differ, or channels do and the processor does not
             say which of its layers depend on them.
     """
+    if not (recipe.turn.is_identity and emulator.recipe.turn.is_identity):
+        # Channels are matched in the network's own axes.
+        return turned(adapted(turned(emulator, emulator.recipe.turn), recipe.turned(recipe.turn)), recipe.turn.inverse)
     old, scene, processor = emulator.scene, recipe.scene, recipe.processor
     if isinstance(processor, Stochastic) and processor.processor == emulator.recipe.processor:
         emulator = with_noise(emulator, processor)
@@ -57,8 +60,47 @@ def adapted(emulator: Emulator, recipe: EmulatorRecipe) -> Emulator:
     return _with_mode_of(emulator, other)
 
 
+@torch.no_grad()
+def turned(emulator: Emulator, turn: Turn) -> Emulator:
+    """A copy of an emulator for its scene in other axes, to which the turn leads from its own.
+
+    It predicts what the emulator does, turned: exactly, but for the rounding of mirrored positions.
+    """
+    recipe, old, state = emulator.recipe.turned(turn), emulator.scene, emulator.state_dict()
+    if turn.is_identity:
+        return emulator
+    inputs, outputs, fields = (turn.channels(names) for names in (old.input_channels, old.output_channels, old.fields))
+    low, high = state["input_low"], state["input_high"]
+    statistics = {
+        "calibrated": state["calibrated"],
+        "input_mean": _signed(state["input_mean"], inputs),
+        "input_std": state["input_std"][[at for at, _ in inputs]],
+        "input_low": torch.stack([-high[at] if mirror else low[at] for at, mirror in inputs]),
+        "input_high": torch.stack([-low[at] if mirror else high[at] for at, mirror in inputs]),
+        "output_scale": state["output_scale"][:, [at for at, _ in outputs]],
+    }
+    if fields:
+        statistics["field_scales.mean"] = _signed(state["field_scales.mean"], fields)
+        statistics["field_scales.std"] = state["field_scales.std"][[at for at, _ in fields]]
+    before, after = (
+        "processor.network." if isinstance(each.processor, Turned) else "processor."
+        for each in (emulator.recipe, recipe)
+    )
+    weights = {name: values for name, values in state.items() if name.startswith("processor.")}
+    other = _built_like(emulator, recipe)
+    other.load_state_dict(statistics | {after + name.removeprefix(before): values for name, values in weights.items()})
+    return _with_mode_of(emulator, other)
+
+
+def _signed(values: Tensor, channels: Sequence[tuple[int, bool]]) -> Tensor:
+    """Values (C, …) of the channels of a turn."""
+    return torch.stack([-values[at] if mirror else values[at] for at, mirror in channels])
+
+
 def with_members(recipe: EmulatorRecipe, members: int) -> EmulatorRecipe:
     """The recipe whose processor reads noise, if there are to be several members."""
+    if isinstance(recipe.processor, Turned):
+        return with_members(recipe.turned(recipe.turn), members).turned(recipe.turn.inverse)
     if members == 1 or isinstance(recipe.processor, Stochastic):
         return recipe
     return dataclasses.replace(recipe, processor=Stochastic(recipe.processor))
@@ -70,6 +112,9 @@ def with_noise(emulator: Emulator, processor: Stochastic | None = None) -> Emula
 
     Raises ConfigError if the network does not say which of its layers depend on channels.
     """
+    if isinstance(emulator.recipe.processor, Turned):
+        turn = emulator.recipe.turn
+        return turned(with_noise(turned(emulator, turn), processor), turn.inverse)
     processor = Stochastic(emulator.recipe.processor) if processor is None else processor
     if (layers := emulator.processor.channel_layers) is None:
         kind = type(emulator.recipe.processor).__name__
@@ -78,7 +123,7 @@ def with_noise(emulator: Emulator, processor: Stochastic | None = None) -> Emula
     inputs, outputs = len(emulator.scene.input_channels), len(emulator.scene.output_channels)
     change = ChannelChange(
         layers,
-        GridLayout(inputs, outputs, emulator.frames, emulator.scene.periodic),
+        GridLayout.of(emulator.scene, emulator.frames),
         [*range(inputs), *[None] * other.processor.noise],
         [OutputSource(channel) for channel in range(outputs)],
         emulator.input_mean,
@@ -102,7 +147,12 @@ def _with_mode_of(emulator: Emulator, other: Emulator) -> Emulator:
     """The other emulator with the runtime and mode of the first, and its frozen weights frozen."""
     frozen = {name for name, weight in emulator.named_parameters() if not weight.requires_grad}
     for name, weight in other.named_parameters():
-        weight.requires_grad_(name not in frozen and name.replace("processor.network.", "processor.") not in frozen)
+        names = {
+            name,
+            name.replace("processor.network.", "processor."),
+            name.replace("processor.", "processor.network."),
+        }
+        weight.requires_grad_(not names & frozen)
     other.runtime = copy.deepcopy(emulator.runtime)
     return other.train(emulator.training)
 
@@ -176,7 +226,7 @@ def _weights(emulator: Emulator, other: Emulator) -> dict[str, Tensor]:
     before, rates = old.input_channels, old.output_channels
     change = ChannelChange(
         layers,
-        GridLayout(len(before), len(rates), emulator.frames, old.periodic),
+        GridLayout.of(old, emulator.frames),
         [before.index(name) if name in before else None for name in new.input_channels],
         [OutputSource((_like(name, rates) or [0])[0], name not in rates) for name in new.output_channels],
         _absent(emulator, other.recipe),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 
 from nmpm.emulator.experience import Experience, Figures, clamp, mean_width
 from nmpm.emulator.recipe import EmulatorRecipe
-from nmpm.scene import Boundary, Scene
+from nmpm.emulator.turns import cosine, describe_turn
+from nmpm.scene import Boundary, Scene, Turn
 
 _GRAVITY, _SPEED, _SPACING = 1.25, 2.0, 1.05
 """Left-over factors beyond which there is a warning; the model's speeds are estimates."""
@@ -23,12 +24,13 @@ class MatchReport:
     Args:
         model: The model's recipe, in its own units.
         recipe: Its form over the data's scene.
-        scene: The data's, as it came.
+        scene: The data's, in the model's axes.
         stride: Frames of the data for one of the model.
         seen: The figures of the model's training.
         figures: Those of the data.
         measured: Whether the data's gravity is not stated but measured.
         names: Of model and data.
+        turn: From the data's axes to the model's.
     """
 
     model: EmulatorRecipe
@@ -39,6 +41,7 @@ class MatchReport:
     figures: Figures
     measured: bool
     names: tuple[str, str]
+    turn: Turn
 
     def lines(self) -> Iterator[str]:
         """Cells, frames, gravity and particles, a line each."""
@@ -58,6 +61,8 @@ class MatchReport:
             f"particles  {figures.spacing**scene.dim:.3g} per cell (model {usual}); speeds up to"
             f" {_number(figures.largest)} cells/frame (model {_number(seen.fastest)})"
         )
+        if not self.turn.is_identity:
+            yield f"axes       {describe_turn(self.turn)}"
 
     def _gravity_line(self) -> str:
         figures, seen = self.figures, self.seen
@@ -118,10 +123,11 @@ class MatchReport:
             return
         if theirs.gravity is None:
             yield f"Gravity differs between the scenes of {data}; {model} has seen one."
-        elif mine.gravity is not None and _cosine(mine.gravity, theirs.gravity) < _ALIGNED:
+        elif mine.gravity is not None and cosine(mine.gravity, theirs.gravity) < _ALIGNED:
+            gravity = list(self.turn.inverse.vector(theirs.gravity))
             yield (
-                f"Gravity of {data} points along {list(theirs.gravity)}, that of {model} along {list(mine.gravity)}:"
-                " turn the data."
+                f"Gravity of {data} points along {gravity}, between its axes, that of {model} along"
+                f" {list(mine.gravity)}: turn the data."
             )
 
     def _figure_warnings(self) -> Iterator[str]:
@@ -141,8 +147,8 @@ class MatchReport:
     def _boundary_warnings(self) -> Iterator[str]:
         (model, data), mine, theirs = self.names, self.model.scene, self.scene
         axes: dict[tuple[Boundary, Boundary], list[str]] = {}
-        for axis, pair in zip("xyz", zip(mine.boundary, theirs.boundary, strict=True), strict=False):
-            axes.setdefault(pair, []).append(axis)
+        for axis, pair in zip(self.turn.axes, zip(mine.boundary, theirs.boundary, strict=True), strict=True):
+            axes.setdefault(pair, []).append(axis.removeprefix("-"))
         for (one, other), names in axes.items():
             if one != other:
                 yield f"Along {', '.join(names)} {data} has the boundary {other!r}, {model} was trained with {one!r}."
@@ -154,7 +160,3 @@ class MatchReport:
 
 def _number(value: float | None) -> str:
     return "unknown" if value is None else f"{value:.3g}"
-
-
-def _cosine(one: Sequence[float], other: Sequence[float]) -> float:
-    return sum(a * b for a, b in zip(one, other, strict=True)) / (math.hypot(*one) * math.hypot(*other))

@@ -80,7 +80,7 @@ class Emulator(nn.Module):
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
         inputs, outputs = len(scene.input_channels), len(scene.output_channels)
-        self.processor = recipe.processor.build(GridLayout(inputs, outputs, frames, scene.periodic))
+        self.processor = recipe.processor.build(GridLayout.of(scene, frames))
         if scene.dim == 2:
             # The memory layout of p2g's output; convolutions are twice as fast in it on a CPU.
             self.processor.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # (torch's stubs lack it)

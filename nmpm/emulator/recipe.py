@@ -14,8 +14,8 @@ from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.model import Emulator
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.processors import Processor, UNet
-from nmpm.scene import Scene
+from nmpm.processors import Processor, Turned, UNet
+from nmpm.scene import Scene, Turn
 from nmpm.transfer import Linear, Transfer
 
 FORMAT = 1
@@ -116,6 +116,23 @@ class EmulatorRecipe:
                 f" {spacing}; whole numbers are needed."
             )
         return dataclasses.replace(self, scene=scene, cells=tuple(round(side) for side in sides))
+
+    @property
+    def turn(self) -> Turn:
+        """From the scene's axes to those of the network."""
+        processor = self.processor
+        return Turn(processor.axes if isinstance(processor, Turned) else tuple("xyz"[: self.scene.dim]))
+
+    def turned(self, turn: Turn) -> Self:
+        """The recipe of the same network for the scene in other axes, to which the turn leads from its own."""
+        to_network = self.turn.after(turn.inverse)
+        network = self.processor.processor if isinstance(self.processor, Turned) else self.processor
+        return dataclasses.replace(
+            self,
+            scene=self.scene.turned(turn),
+            cells=turn.permuted(self.grid.shape),
+            processor=network if to_network.is_identity else Turned(network, to_network.axes),
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The recipe as plain lists, strings and numbers, with the version of this form; without what is absent."""

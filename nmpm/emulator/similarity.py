@@ -19,6 +19,7 @@ from nmpm.emulator.material_names import describe_materials, match_materials
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.recipe import EmulatorRecipe
 from nmpm.emulator.similar_grid import SimilarGrid, aligned_scales, similar_grid
+from nmpm.emulator.turns import find_turn
 from nmpm.errors import ConfigError
 from nmpm.scene import Motion, Reading, Scene
 
@@ -47,7 +48,8 @@ class Match:
     Args:
         recipe: The model's form over the data's scene, in the data's units.
         reading: How the data are read for it.
-        lines: Cells, frames, gravity, particles and materials, a line each, to be checked by eye.
+        lines: Cells, frames, gravity, particles and materials, a line each, to be checked by eye; axes where they are
+            not the model's.
         warnings: What could not be matched, with its factor.
         gravity: The data's over the model's, in cells per frame²; None where one has none, or several.
     """
@@ -68,7 +70,10 @@ def find_match(
     strict: bool = False,
     names: tuple[str, str] = ("the model", "the data"),
 ) -> Match:
-    """The cells, the stride and the materials with which a model takes the scenes of foreign data.
+    """The cells, the stride, the axes and the materials with which a model takes the scenes of foreign data.
+
+    Where the data's gravity points along another axis than that of the model's training, the network works in turned
+    axes: states, rollouts and the recipe's scene stay in the data's.
 
     A scene in the model's units, with its time step and gravity and a domain of whole cells, keeps the model's cells,
     as `EmulatorRecipe.over` does.
@@ -97,20 +102,23 @@ def find_match(
     known = {name: to for name, to in emulator.scene.aliases if name in scene.materials}
     given = known | dict(materials or {})
     renamed = match_materials(theirs, scene.materials, given, names)
+    turn = find_turn(emulator, scene)
+    scene, motion = scene.turned(turn), motion.turned(turn)
     aliases = tuple((name, to) for name, to in (dict(emulator.scene.aliases) | renamed).items() if to != name)
     on_channels = dataclasses.replace(_with_channels_of(emulator.scene, scene), aliases=aliases)
     search = _Search(emulator, on_channels, motion, Experience.of(emulator))
     recipe, step = search.find(stride, names)
     figures = Figures.of(scene, motion, recipe.grid.spacing, step)
-    report = MatchReport(emulator.recipe, recipe, scene, step, search.seen, figures, measured, names)
+    report = MatchReport(emulator.recipe, recipe, scene, step, search.seen, figures, measured, names, turn)
     warnings = tuple(report.warnings())
     if strict and warnings:
         raise ConfigError(f"{' '.join(warnings)} Without strict these are warnings.")
     told = describe_materials(renamed, theirs, given, names[0])
     lines = (*report.lines(), f"materials  {told}{'; obstacles -> solid channel' * scene.obstacles}")
     differing = {name: to for name, to in renamed.items() if to != name}
+    gravity, recipe = _gravity_ratio(recipe, emulator.recipe), recipe.turned(turn.inverse)
     reading = Reading(recipe.scene, differing, *step.as_integer_ratio())
-    return Match(recipe, reading, lines, warnings, _gravity_ratio(recipe, emulator.recipe))
+    return Match(recipe, reading, lines, warnings, gravity)
 
 
 def _gravity_ratio(recipe: EmulatorRecipe, model: EmulatorRecipe) -> float | None:

@@ -9,6 +9,7 @@ from nmpm.processors.baselines import Identity, Pointwise
 from nmpm.processors.fourier import FFNO, FNO, TFNO
 from nmpm.processors.patched import Patched
 from nmpm.processors.stochastic import Stochastic
+from nmpm.processors.turned import Turned
 from nmpm.processors.unet import UNet
 from nmpm.processors.ushape import ConvNeXt, UNetModern
 
@@ -26,6 +27,7 @@ __all__ = [
     "Pointwise",
     "Processor",
     "Stochastic",
+    "Turned",
     "UNet",
     "UNetModern",
 ]

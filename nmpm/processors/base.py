@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor, nn
 
 from nmpm.grid import Grid
+from nmpm.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -26,12 +28,22 @@ class GridLayout:
         out_channels: C_out, velocity channels for each predicted frame.
         frames: m, frames predicted by one call (time bundling).
         periodic: Whether each space axis wraps; its length is the number of axes.
+        in_names, out_names: Names of the scene's channels, for networks to which directions matter; what else a network
+            reads has none.
     """
 
     in_channels: int
     out_channels: int
     frames: int
     periodic: tuple[bool, ...]
+    in_names: tuple[str, ...] = ()
+    out_names: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, scene: Scene, frames: int) -> Self:
+        """The layout of a scene's channels."""
+        names = scene.input_channels, scene.output_channels
+        return cls(len(names[0]), len(names[1]), frames, scene.periodic, *names)
 
     @property
     def dim(self) -> int:

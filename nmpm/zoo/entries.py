@@ -158,9 +158,7 @@ def read_recipe(plain: Mapping[str, Any]) -> EmulatorRecipe:
     for name, size, limit in (("cells", recipe.grid.size, CELLS), ("frames", recipe.frames, FRAMES)):
         if size > limit:
             raise ConfigError(f"{name}: {size:,} are more than {limit:,}, the most that is loaded.")
-    layout = GridLayout(
-        len(recipe.scene.input_channels), len(recipe.scene.output_channels), recipe.frames, recipe.scene.periodic
-    )
+    layout = GridLayout.of(recipe.scene, recipe.frames)
     # Without memory for its parameters, which not all plugins support; the size is watched again in `build`.
     with torch.device("meta"), bounded_network(), suppress(RuntimeError, NotImplementedError):
         recipe.processor.build(layout)

@@ -2,16 +2,19 @@
 
 import dataclasses
 from fractions import Fraction
+from itertools import permutations, product
 
 import pytest
 import torch
 from scenes import box, cloud, emulator_of
 
-from nmpm.emulator import EmulatorRecipe, rollout
+from nmpm.emulator import EmulatorRecipe, differentiable_rollout, rollout
+from nmpm.emulator.adaptation import with_members, with_noise
+from nmpm.emulator.model import UNLIMITED
 from nmpm.emulator.similarity import find_match
 from nmpm.errors import ConfigError
 from nmpm.processors import UNet
-from nmpm.scene import Motion
+from nmpm.scene import Motion, Turn
 
 
 def model_of(scene=None, cells=24, **statistics):
@@ -168,11 +171,11 @@ def test_a_rougher_match_is_a_warning_with_its_factor_and_strictly_refused():
         ({"gravity": None}, Motion(), "Gravity of the data is not known"),
         ({"gravity": (0.0, 0.0)}, Motion(), "has no gravity, but the model learnt to fall"),
         ({"gravity": None, "gravity_varies": True}, Motion(), "Gravity differs between the scenes"),
-        ({"gravity": (0.0, 9.81 * 250 / 1600)}, Motion(), "points along"),
+        ({"gravity": (6.0 * 250 / 1600, 8.0 * 250 / 1600)}, Motion(), "points along"),
         ({"obstacles": True, "moving_obstacles": True}, Motion(), "moving obstacles"),
         ({}, Motion(1.0, 100.0), "times those that the model is calibrated for"),
     ],
-    ids=["unknown", "none", "differing", "upwards", "moving", "fast"],
+    ids=["unknown", "none", "differing", "oblique", "moving", "fast"],
 )
 def test_warnings_name_what_differs(change, motion, warning):
     emulator = model_of()
@@ -280,3 +283,120 @@ def test_a_box_of_fewer_cells_than_the_models_gets_finer_ones():
     small = dataclasses.replace(scene, bounds=((0.0, 60.0), (0.0, 60.0)), domain=((-2.0, 62.0), (-2.0, 62.0)))
     width = find_match(emulator, small).recipe.grid.spacing[0]
     assert 0.7 < width / (250 * emulator.grid.spacing[0]) < 0.98
+
+
+TURNS = [
+    Turn(tuple(map("".join, zip(signs, order, strict=True))))
+    for axes in ("xy", "xyz")
+    for order in permutations(axes)
+    for signs in product(("", "-"), repeat=len(axes))
+]
+
+
+def along(vectors, turn):
+    """Vectors (..., D) in the axes that a turn makes of theirs."""
+    return vectors[..., list(turn.sources)] * torch.tensor([-1.0 if mirror else 1.0 for mirror in turn.mirrored])
+
+
+def in_axes(state, turn):
+    names = ("position", "velocity", "obstacle", "obstacle_velocity", "gravity")
+    return dataclasses.replace(state, **{name: along(getattr(state, name), turn) for name in names})
+
+
+def oblong(dim=2, **changes):
+    """A scene with sides that differ, a floor thinner than the ceiling, and obstacles that move."""
+    bounds = ((0.1, 0.9), (0.15, 0.85), (0.2, 0.9))[:dim]
+    gravity = (0.0, -9.81, 0.0)[:dim]
+    facts = {"bounds": bounds, "domain": ((0.08, 0.92),) * dim, "gravity": gravity, "boundary": ("wall",) * dim}
+    return box(dim, ("water", "sand"), **(facts | {"obstacles": True, "moving_obstacles": True} | changes))
+
+
+def moving(scene, **changes):
+    state = cloud(scene, statics=6, count=40)
+    return dataclasses.replace(state, obstacle_velocity=torch.full_like(state.obstacle, 1e-3), **changes)
+
+
+@pytest.mark.parametrize("turn", TURNS, ids=lambda turn: "".join(turn.axes))
+@torch.no_grad()
+def test_data_whose_gravity_points_elsewhere_are_predicted_as_data_that_are_turned_by_hand(turn):
+    scene = oblong(len(turn.axes))
+    emulator, state, data = model_of(scene, cells=12), in_axes(moving(scene), turn), scene.turned(turn)
+    match = find_match(emulator, data, stride=Fraction(1))
+    assert not match.warnings
+    assert (len(match.lines) == 6) == (not match.recipe.turn.is_identity)
+    found = match.recipe.turn
+    assert found.vector(data.gravity) == scene.gravity
+    by_hand = emulator.matched(find_match(emulator, data.turned(found), stride=Fraction(1)))
+    assert by_hand.recipe.turn.is_identity
+    expected = rollout(by_hand, in_axes(state, found), 9)
+    predicted = rollout(emulator.matched(match), state, 9)
+    torch.testing.assert_close(along(predicted, found), expected, rtol=0, atol=2e-6)
+
+
+def test_a_match_says_which_axis_is_which():
+    emulator, turn = model_of(oblong(3), cells=12), Turn(("x", "z", "-y"))
+    match = find_match(emulator, emulator.scene.turned(turn))
+    assert match.lines[4] == "axes       -z of the data is y of the model, y of the data is z of the model"
+    assert match.recipe.scene.bounds == emulator.scene.turned(turn).bounds
+
+
+def test_periodic_axes_are_those_of_the_model():
+    scene = oblong(3, boundary=("periodic", "wall", "wall"), domain=((0.1, 0.9), (0.08, 0.92), (0.08, 0.92)))
+    swapped = Turn(("z", "y", "x"))
+    assert find_match(model_of(scene, cells=(12, 12, 12)), scene.turned(swapped)).recipe.turn == swapped
+
+
+def test_gravity_between_the_axes_is_left_as_it_is():
+    emulator = model_of(oblong())
+    match = find_match(emulator, oblong(gravity=(6.0, -7.0)))
+    assert match.recipe.turn.is_identity
+    assert any("between its axes" in warning for warning in match.warnings)
+
+
+def test_gradients_flow_through_turned_axes():
+    emulator, turn = model_of(oblong()).requires_grad_(False), Turn(("y", "x"))
+    turned = emulator.matched(find_match(emulator, emulator.scene.turned(turn)))
+    gradients = []
+    for model, state in ((emulator, moving(emulator.scene)), (turned, in_axes(moving(emulator.scene), turn))):
+        velocity = state.velocity.clone().requires_grad_()
+        differentiable_rollout(model, dataclasses.replace(state, velocity=velocity), 6).square().sum().backward()
+        gradients.append(velocity.grad)
+    torch.testing.assert_close(gradients[1].flip(-1), gradients[0])
+
+
+@pytest.mark.parametrize("steady", [True, False])
+def test_a_model_of_gravities_that_vary_turns_data_only_where_their_direction_did_not(steady):
+    emulator = model_of(oblong(gravity=None, gravity_varies=True))
+    size = 9.81 * 0.0025**2 / emulator.grid.spacing[0]
+    emulator.input_mean[-2:], emulator.input_std[-2:] = 0.0, size
+    if steady:
+        emulator.input_mean[-1], emulator.input_std[-1], emulator.input_std[-2] = -size, size / 3, 1.0
+        emulator.input_low[-2], emulator.input_high[-2] = -UNLIMITED, UNLIMITED
+    match = find_match(emulator, oblong(gravity=(9.81, 0.0)))
+    assert match.recipe.turn.axes == (("y", "-x") if steady else ("x", "y"))
+
+
+def test_turned_models_are_stored_matched_again_and_given_noise():
+    emulator, turn = model_of(oblong()), Turn(("-y", "x"))
+    turned = emulator.matched(find_match(emulator, emulator.scene.turned(turn)))
+    stored = EmulatorRecipe.from_dict(turned.recipe.to_dict()).build().eval()
+    stored.load_state_dict(turned.state_dict())
+    state = in_axes(moving(emulator.scene), turn)
+    for other in (stored, with_noise(turned), turned.matched(find_match(turned, turned.scene))):
+        assert torch.equal(rollout(other, state, 6), rollout(turned, state, 6))
+    back = turned.matched(find_match(turned, emulator.scene))
+    assert back.recipe == emulator.recipe
+    assert torch.equal(rollout(back, moving(emulator.scene), 6), rollout(emulator, moving(emulator.scene), 6))
+    assert with_members(turned.recipe, 2) == with_noise(turned).recipe
+
+
+def test_a_turned_model_takes_added_channels_as_the_model_does():
+    emulator = model_of(box(materials=("water", "sand")))
+    turn = find_match(emulator, emulator.scene.turned(Turn(("y", "x")))).recipe.turn
+    data = dataclasses.replace(emulator.scene, obstacles=True, moving_obstacles=True, materials=("a", "b"))
+    mapped = {"a": "water", "b": "sand"}
+    plain = emulator.matched(find_match(emulator, data, materials=mapped))
+    turned = emulator.matched(find_match(emulator, data.turned(turn.inverse), materials=mapped))
+    state = moving(data)
+    expected = along(rollout(plain, state, 6), turn.inverse)
+    torch.testing.assert_close(rollout(turned, in_axes(state, turn.inverse), 6), expected, rtol=0, atol=2e-6)
