@@ -23,7 +23,8 @@ import numpy as np
 from nmpm._support.atomic import atomic_write, lock_folder, temporary_files
 from nmpm._support.bounded_files import NPZ_ERRORS
 from nmpm._support.progress import progress_bar
-from nmpm._support.threads import usable_cores
+from nmpm._support.threads import map_ranges, usable_cores
+from nmpm._support.threads import split as split_ranges
 from nmpm._support.version import __version__
 from nmpm.data.format import METADATA_FILE, Metadata, Split, Trajectory, read_metadata, write_metadata, write_split
 from nmpm.data.metadata import scene_metadata
@@ -220,8 +221,9 @@ def _read_parts(paths: Iterable[Path], advance: Callable[[], object]) -> Iterato
 def _write_metadata(request: SimulationRequest, folder: Path) -> None:
     metadata = preset_metadata(request.preset)
     first, statistics = Split(folder / f"{request.splits[0]}.h5"), MotionStatistics(metadata)
-    for index in range(len(first)):
-        statistics.add(first.read(index))
+    trajectories = split_ranges(len(first), 1)
+    for moments in map_ranges(lambda index, _: statistics.moments(first.read(index)), trajectories, usable_cores()):
+        statistics.add_moments(moments)
     redrawn: dict[str, dict[str, int]] = {}  # how many seeds of a trajectory were unstable, where some were
     for split in request.splits:
         stored = Split(folder / f"{split}.h5")

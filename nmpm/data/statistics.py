@@ -137,14 +137,27 @@ class MotionStatistics:
 
     def add(self, trajectory: Trajectory) -> None:
         """Adds a trajectory."""
+        self.add_moments(self.moments(trajectory))
+
+    def add_moments(self, moments: Mapping[str, np.ndarray]) -> None:
+        """Adds the moments of a trajectory."""
+        for key, values in moments.items():
+            self._sums[key] += values
+
+    def moments(self, trajectory: Trajectory) -> dict[str, np.ndarray]:
+        """(3, D) count, sum and sum of squares of a trajectory's velocities and accelerations."""
         moving = self._metadata.is_moving(trajectory.particle_type)
-        velocity = displacements(trajectory.position[:, moving], self._metadata)
+        position = trajectory.position if moving.all() else trajectory.position[:, moving]
+        velocity, moments = displacements(position, self._metadata), {}
         for key, values in (("vel", velocity), ("acc", np.diff(velocity, axis=0))):
-            flat = values.reshape(-1, values.shape[-1])
-            if np.isnan(total := flat.sum(0)).any():
-                flat = flat[~np.isnan(flat[:, 0])]
-                total = flat.sum(0)
-            self._sums[key] += np.stack([np.full(flat.shape[1], len(flat)), total, (flat**2).sum(0)])
+            moments[key] = np.empty((3, values.shape[-1]))
+            for axis, along in enumerate(np.moveaxis(values, -1, 0)):
+                flat = along.ravel()  # next to each other, sums are several times as fast
+                if np.isnan(total := flat.sum()):
+                    flat = flat[~np.isnan(flat)]
+                    total = flat.sum()
+                moments[key][:, axis] = len(flat), total, np.square(flat).sum()
+        return moments
 
     def result(self) -> dict[str, list[float]]:
         """`vel_mean`, `vel_std`, `acc_mean` and `acc_std` per axis; those without any sample are left out."""
