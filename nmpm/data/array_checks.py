@@ -13,6 +13,9 @@ CORE = ("position", "particle_type")
 
 _SWAPPED = 10.0
 _SAMPLE = 64  # frames and particles that are compared
+_USUAL = 0.25  # quantile of the sizes of frames: some may have overflowed, or collapsed
+_ABSURD = 1000.0  # times the usual size: no particle gets so far
+_MANY = 0.1  # of the particles
 
 
 def check_arrays(position: Any, particle_type: Any, where: str) -> None:
@@ -74,6 +77,35 @@ def check_end(position: np.ndarray, where: str) -> None:
             f"{where}: all positions are NaN from frame {frame} on; the simulation seems to have diverged. Cut the"
             f" trajectory before that frame: position[:{frame}]."
         )
+
+
+def frames_at_one_point(position: np.ndarray) -> np.ndarray:
+    """(T,) whether all particles that are there in a frame of (T, N, D) positions, two or more, are at one point."""
+    low, high = np.fmin.reduce(position, axis=1), np.fmax.reduce(position, axis=1)
+    return np.asarray((low == high).all(axis=1) & ((~np.isnan(position[..., 0])).sum(axis=1) > 1))
+
+
+def particles_far_away(position: np.ndarray) -> np.ndarray:
+    """(T, N) whether a particle is absurdly far from where all others are in most frames, as after an overflow."""
+    low, high = np.fmin.reduce(position, axis=1), np.fmax.reduce(position, axis=1)
+    with np.errstate(over="ignore"):
+        sizes = (high - low).max(axis=1)
+    known = np.isfinite(sizes) & (sizes > 0)
+    if not known.any():
+        return np.zeros(position.shape[:2], bool)
+    usual = np.flatnonzero(known)[np.argsort(sizes[known], kind="stable")[int(_USUAL * (known.sum() - 1))]]
+    reach = _ABSURD * float(sizes[usual])
+    centre = (low[usual] + high[usual]) / 2
+    if np.abs(np.stack([low - centre, high - centre])[:, known]).max() <= reach:
+        return np.zeros(position.shape[:2], bool)
+    return np.asarray((np.abs(position - centre) > reach).any(axis=2))
+
+
+def broken_frames(position: np.ndarray) -> np.ndarray:
+    """(T,) whether a frame of (T, N, D) positions is no data: all particles at one point, or many far away."""
+    far: np.ndarray = particles_far_away(position).mean(axis=1) > _MANY
+    broken: np.ndarray = frames_at_one_point(position) | far
+    return broken
 
 
 def check_axes(position: np.ndarray, particles: int | None, where: str) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nmpm.data.array_checks import particles_far_away
 from nmpm.data.convert.base import Options
 from nmpm.data.fields import FieldFacts, Kind, add_fields, require_fields
 from nmpm.data.format import METADATA_FILE, Metadata, Split, read_metadata
@@ -62,6 +63,8 @@ def infer_scene(folder: Path, options: Options | None = None) -> Scene:
             metadata.is_obstacle(trajectory.particle_type),
         )
         position = without_those_gone(trajectory.position, metadata)
+        if (far := particles_far_away(position)).any():  # an inspection names these
+            position = np.where(far[..., None], np.nan, position)
         moving.add(position[:, moves])
         everything.add(position[:, moves | is_obstacle])
     bounds, domain = _extents(metadata, moving, everything, folder)

@@ -1,15 +1,21 @@
-"""Times of frames: whether their steps are even, as models need them."""
+"""Times of frames: whether their steps are even, as models need them, and what is wrong with those that are not."""
 
 from __future__ import annotations
 
+from bisect import bisect_left
+from dataclasses import dataclass, replace
+
 import numpy as np
 
+from nmpm._support.messages import counted
 from nmpm.data.format import Trajectory
 from nmpm.errors import DataError
 
 _TOLERANCE = 0.02  # of a step
+_JITTER = 0.25  # of a step: times that are so close to even ones jitter
 _DECIMALS = range(10)
 _COARSE = 0.15  # of a step; differences are not put down to rounding that is coarser
+_RESTART = 0.9  # of the frames are in order where a simulation was restarted
 
 
 def uneven_step(time: np.ndarray) -> tuple[int, float] | None:
@@ -23,7 +29,7 @@ def uneven_step(time: np.ndarray) -> tuple[int, float] | None:
     mean = float(steps.mean())
     if mean > 0 and np.abs(steps - mean).max() <= max(_TOLERANCE * mean, _rounding(time, mean)):
         return None
-    usual = float(np.median(steps)) or mean or 1.0
+    usual = usual_step(time) or mean or 1.0
     factors = steps / usual
     badness = np.where(factors > 0, np.abs(np.log(np.maximum(factors, 1e-300))), np.inf)
     frame = int(np.argmax(badness))
@@ -31,18 +37,102 @@ def uneven_step(time: np.ndarray) -> tuple[int, float] | None:
 
 
 def usual_step(time: np.ndarray) -> float:
-    """The mean step of (T,) times where the steps are even, so that rounding does not count, else the median."""
+    """The mean step of (T,) times that are even but for rounding and jitter, else the median step."""
     steps = np.diff(np.asarray(time, dtype=np.float64))
-    return float(np.median(steps) if uneven_step(time) else steps.mean())
+    mean = float(steps.mean())
+    even = mean > 0 and np.abs(time - time[0] - mean * np.arange(len(time))).max() <= _JITTER * mean
+    return mean if even and np.abs(steps - mean).max() <= _JITTER * mean else float(np.median(steps))
 
 
 def recorded_step(trajectory: Trajectory) -> float | None:
     """The usual step of a trajectory's recorded times; None where none are recorded, or they do not grow."""
-    time = np.asarray(trajectory.fields.get("time", ()), dtype=np.float64)
-    if time.shape != (len(trajectory.position),) or len(time) < 2 or not np.isfinite(time).all():
+    time = recorded_times(trajectory)
+    if time is None or len(time) < 2 or not np.isfinite(time).all():
         return None
     step = usual_step(time)
     return step if step > 0 else None
+
+
+def recorded_times(trajectory: Trajectory) -> np.ndarray | None:
+    """(T,) float64 recorded times of a trajectory's frames; None where there are none."""
+    time = np.asarray(trajectory.fields.get("time", ()), dtype=np.float64)
+    return time if time.shape == (len(trajectory.position),) else None
+
+
+@dataclass(frozen=True)
+class TimeFault:
+    """What is wrong with the times of frames, and how to mend it."""
+
+    sentence: str  # begins with "its"
+    remedy: str  # options of `nmpm convert` or a sentence
+    frame: int  # where it shows first
+    factor: float  # of the step there over the usual one
+    jitter: bool = False  # whether steps merely vary around their mean
+
+
+def find_time_fault(time: np.ndarray) -> TimeFault | None:
+    """What is wrong with (T,) times: missing, going back, repeated, uneven or jittering; None if nothing is."""
+    known = np.isfinite(time)
+    if not known.all():
+        frame = int(np.argmin(known))
+        many = counted(int((~known).sum()), "frame")
+        remedy = "State the time between frames: --dt."
+        return TimeFault(f"its times are missing in {many}, first in frame {frame}.", remedy, frame, 1.0)
+    uneven = uneven_step(time)
+    if uneven is None:
+        return None
+    (frame, factor), step, steps = uneven, usual_step(time), np.diff(time)
+    back = np.flatnonzero(steps < 0)
+    if len(back):
+        frame = int(back[0]) + 1
+        if time[frame] <= time[0] and len(increasing_frames(time)) < _RESTART * len(time):
+            sentence = f"its times start again in frame {frame}, at {time[frame]:.4g}: it holds more than one run."
+            return TimeFault(sentence, "Give each run a file, or arrays, of its own.", frame, factor)
+        sentence = f"its times go back in frame {frame}, from {time[frame - 1]:.4g} to {time[frame]:.4g}: a restart?"
+    elif (steps == 0).any():
+        frame = int(np.argmax(steps == 0)) + 1
+        many = counted(int((steps == 0).sum()), "frame")
+        sentence = f"its times repeat: {many} at the time of the frame before, first frame {frame}."
+    else:
+        sentence = (
+            f"its steps in time are uneven: frame {frame} is {factor:.3g} usual steps of {step:.4g} after the one"
+            f" before; {int((np.abs(steps / step - 1) > _TOLERANCE).sum())} of {len(steps)} steps differ."
+        )
+        if step == steps.mean():  # they jitter
+            jitter = float(np.abs(steps / step - 1).max())
+            sentence = f"its steps in time jitter by up to {jitter:.1%} around their mean, {step:.6g}."
+            return TimeFault(sentence, f"--resample {step:.6g}", frame, factor, jitter=True)
+    return TimeFault(sentence, f"--resample {float(np.median(steps[steps > 0])):.6g}", frame, factor)
+
+
+def increasing_frames(time: np.ndarray) -> np.ndarray:
+    """Indices of the most frames of (T,) times that increase; of frames that exclude each other the later ones."""
+    ends: list[float] = []  # negated last times of increasing sequences, read from the end, by length
+    last = list[int]()
+    before = np.full(len(time), -1)
+    for index in range(len(time) - 1, -1, -1):
+        place = bisect_left(ends, -time[index])
+        before[index] = last[place - 1] if place else -1
+        if place == len(ends):
+            ends.append(-time[index])
+            last.append(index)
+        elif -time[index] < ends[place]:
+            ends[place], last[place] = -time[index], index
+    frames = list[int]()
+    index = last[-1]
+    while index >= 0:
+        frames.append(index)
+        index = int(before[index])
+    return np.array(frames)
+
+
+def take_frames(trajectory: Trajectory, frames: np.ndarray) -> Trajectory:
+    """Some frames of a trajectory, with all of its particles; fields whose first axis counts frames follow."""
+    count = len(trajectory.position)
+    fields = {
+        name: values[frames] if values.shape[:1] == (count,) else values for name, values in trajectory.fields.items()
+    }
+    return replace(trajectory, position=trajectory.position[frames], fields=fields)
 
 
 def _rounding(time: np.ndarray, step: float) -> float:
@@ -55,12 +145,9 @@ def _rounding(time: np.ndarray, step: float) -> float:
 
 
 def check_times(time: np.ndarray | None, where: str) -> None:
-    """Raises a DataError that names the most unusual step if those of (T,) times are uneven."""
-    uneven = None if time is None else uneven_step(time)
-    if time is not None and uneven is not None:
-        (frame, factor), usual = uneven, usual_step(time)
-        raise DataError(
-            f"{where}: its steps in time are uneven: frame {frame} is {factor:.3g} usual steps of {usual:.4g} after the"
-            f" one before; models need even ones. Resample the positions: --resample {usual:.4g} (fit: --data.resample"
-            f" {usual:.4g})."
-        )
+    """Raises a DataError that says what is wrong with (T,) times if their steps are uneven, and the remedy."""
+    if time is not None and (fault := find_time_fault(time)) is not None:
+        remedy, option = fault.remedy, fault.remedy.removeprefix("--")
+        if option != remedy:
+            remedy = f"Models need even ones; interpolate the positions: {remedy} (fit: --data.{option})."
+        raise DataError(f"{where}: {fault.sentence} {remedy}")

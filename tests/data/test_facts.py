@@ -249,9 +249,28 @@ class TestTime:
         velocity = np.gradient(run, axis=0) / 0.04
         fact = facts_of(run, velocity=velocity)
         assert fact.dt.value == pytest.approx(0.04, rel=2e-3)
-        steps = facts_of(run, velocity=velocity, time=100.0 * np.arange(20)).dt
-        assert steps.value == pytest.approx(0.04, rel=2e-3)
-        assert "another unit" in steps.how
+        backward = np.diff(run, axis=0, prepend=run[:1]) / 0.04
+        assert facts_of(run, velocity=backward).dt.value == pytest.approx(0.04, rel=1e-6)
+
+    @pytest.mark.parametrize("step", [0.01, 1 / 240, 0.3333, 100.0])
+    def test_velocities_never_overrule_recorded_times(self, rng, step):
+        run = thrown(rng, (0.0, -2.0), frames=20)
+        velocity, time = np.gradient(run, axis=0) / 0.04, step * np.arange(20)
+        assert facts_of(run, velocity=velocity, time=time).dt.value == pytest.approx(step, rel=1e-12)
+
+    def test_velocities_tell_how_long_a_numbered_step_is(self, rng):
+        run = thrown(rng, (0.0, -2.0), frames=20)
+        finder = FactFinder(2, steps=True)
+        fields = {"time": 100.0 * np.arange(20)}
+        finder.add(Trajectory(run, np.zeros(144, int), {}, fields))
+        assert finder.facts().dt.value == 100.0
+        finder = FactFinder(2, steps=True)
+        finder.add(Trajectory(run, np.zeros(144, int), {}, fields | {"velocity": np.gradient(run, axis=0) / 0.04}))
+        assert finder.facts().dt.value == pytest.approx(0.04, rel=2e-3)
+
+    def test_other_velocities(self, rng):
+        run = thrown(rng, (0.0, -2.0), frames=20)
+        velocity = np.gradient(run, axis=0) / 0.04
         assert facts_of(run, velocity=velocity * 0.04, time=0.1 * np.arange(20)).dt.value == 0.1
 
 
@@ -363,7 +382,7 @@ def test_facts_of_recordings_by_other_programs(recorded, folder, dt, gravity, bo
     if folder == "warp-sph-vtk":
         pytest.importorskip("pyvista")
     dataset = open_dataset(recorded / "third-party" / folder)
-    finder = FactFinder(dataset.metadata.dim)
+    finder = FactFinder(dataset.metadata.dim, steps=dataset.steps)
     for trajectory in islice(dataset.splits["train"](), 3):
         finder.add(trajectory)
     facts = finder.facts()

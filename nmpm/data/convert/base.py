@@ -134,6 +134,7 @@ class ForeignDataset:
     counts: Mapping[str, int | None] = field(default_factory=dict)  # None where only reading all would tell
     assumed: frozenset[str] = frozenset()  # fields of the metadata that the files do not state
     unknown: frozenset[str] = frozenset()  # fields of the metadata that are to be found in the trajectories
+    steps: bool = False  # whether times are numbers of a simulator's steps, of a length that the files do not state
     whole: ForeignDataset | None = None  # the same without cuts, where runs were cut along time into splits
 
 

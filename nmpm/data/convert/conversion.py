@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from nmpm._support.atomic import new_folder
@@ -80,9 +81,20 @@ def _write(source: ForeignDataset, folder: Path, problems: list[str] | None) -> 
         raise DataError(f"{names[0]} split: its trajectories have one frame each; motion needs two or more.")
     if source.unknown:
         log.find_unknown(Split(folder / f"{names[0]}.h5"))
+    if source.steps and (factor := log.length_of_step()) != 1:
+        for name in names:
+            _scale_times(folder / f"{name}.h5", factor)
     metadata, notes = log.final_metadata()
     write_metadata(folder, replace(metadata, extra=metadata.extra | {NOTES: [*source.notes, *notes]}))
     return (*source.notes, *notes, *log.extent.notes(metadata))
+
+
+def _scale_times(path: Path, factor: float) -> None:
+    """Multiplies the recorded times of a split's trajectories."""
+    with h5py.File(path, "r+") as file:
+        for group in file.values():
+            if "time" in group:
+                group["time"][...] = factor * group["time"][()]
 
 
 class _Log:
@@ -101,7 +113,7 @@ class _Log:
         self.extent = Extent(self.metadata.dim)
         dt = None if "dt" in self.unknown else self.metadata.dt
         boundary = None if "boundary" in self.unknown else self.metadata.boundary
-        self._finder = FactFinder(self.metadata.dim, dt, self.metadata.obstacle_types, boundary)
+        self._finder = FactFinder(self.metadata.dim, dt, self.metadata.obstacle_types, boundary, source.steps)
         self._facts: list[str] = []
 
     def watch(
@@ -139,6 +151,11 @@ class _Log:
         self.extent.gone += count_gone(position[:, moving], metadata)
         self.frames.add(len(position))
         self.particles = max(self.particles, position.shape[1])
+
+    def length_of_step(self) -> float:
+        """The length of a simulator's step by whose number frames are, where dt is known otherwise; else 1."""
+        apart = self._finder.recorded_step
+        return self.metadata.dt / apart if apart else 1.0
 
     def find_unknown(self, split: Split) -> None:
         """Completes the metadata by facts about the trajectories; `split` is the first one, as written."""

@@ -112,7 +112,9 @@ class FrameFormat(DatasetFormat):
         metadata = placeholder_metadata(len(layout.axes), particle_types=names, **facts)
         notes = (*layout.notes(), *gaps, *self.notes(first, options))
         read = partial(self._read_all, layout=layout)
-        return open_divided({"all": runs}, (metadata, EVERYTHING_UNKNOWN - set(facts), notes), read, options)
+        dataset = open_divided({"all": runs}, (metadata, EVERYTHING_UNKNOWN - set(facts), notes), read, options)
+        steps = first[0].time is None and first[0].step is not None
+        return replace(dataset, steps=steps, whole=dataset.whole and replace(dataset.whole, steps=steps))
 
     def _folders(self, path: Path) -> Iterator[tuple[Path, list[Path]]]:
         """Yields folders with files of this format and these files; of a file its own."""

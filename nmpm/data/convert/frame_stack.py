@@ -43,6 +43,7 @@ class FrameStack:
         self._last: tuple[np.ndarray, np.ndarray] | None = None  # ids of the last frame, and their slots
         self._times: list[float] = []
         self._start: np.datetime64 | None = None  # where times are dates
+        self._steps: list[float] = []
         self._first = ""  # the first frame with particles
         self._empty = ""
         self._left_out: set[str] = set()
@@ -63,6 +64,7 @@ class FrameStack:
             self._start = time if self._start is None else self._start
             time = float((time - self._start) / np.timedelta64(1, "s"))
         self._times.append(np.nan if time is None else time)
+        self._steps.append(np.nan if frame is None or frame.step is None else frame.step)
         self._count += 1
 
     def _add_particles(self, frame: Frame, where: str) -> None:
@@ -203,12 +205,12 @@ class FrameStack:
         return Trajectory(position, types[order], {}, values | self._time())
 
     def _time(self) -> dict[str, np.ndarray]:
-        """The field `time` (T,), where at least two frames state it; the others are interpolated."""
-        times = np.array(self._times)
-        stated = np.flatnonzero(~np.isnan(times))
-        if len(stated) < max(2, len(times) // 2) or np.ptp(times[stated]) == 0:
-            return {}
-        return {"time": np.interp(np.arange(len(times)), stated, times[stated])}
+        """The field `time` (T,), or steps' numbers, where two or more frames state it; the others are interpolated."""
+        for values in map(np.array, (self._times, self._steps)):
+            stated = np.flatnonzero(~np.isnan(values))
+            if len(stated) >= max(2, len(values) // 2) and np.ptp(values[stated]) > 0:
+                return {"time": np.interp(np.arange(len(values)), stated, values[stated])}
+        return {}
 
 
 def _constant(name: str, values: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ Both work on the pieces of a particle's track between absences, each for itself:
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -13,9 +14,16 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 
+from nmpm._support.messages import counted
+from nmpm.data.array_checks import broken_frames, particles_far_away
 from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset, Options
+from nmpm.data.facts.sample import take_sample
+from nmpm.data.facts.timing import step_by_velocities
 from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.times import find_time_fault, increasing_frames, recorded_times, take_frames, usual_step
 from nmpm.errors import DataError
+
+_log = logging.getLogger(__name__)
 
 _GAP = 2.5  # longer steps in time, in usual or new ones, are gaps
 _TOLERANCE = 0.05  # of a step: further from a piece's ends than that, there is no particle
@@ -34,9 +42,13 @@ def retime(dataset: ForeignDataset, options: Options) -> ForeignDataset:
     """
     metadata, notes = dataset.metadata, dataset.notes
     changes = list[Callable[[Trajectory], Trajectory]]()
+    if options.dt is not None:
+        changes.append(_without_times)
     if options.resample is not None:
         dt = None if "dt" in dataset.unknown else metadata.dt
         changes.append(partial(_resample_stored, dt=dt, step=options.resample, metadata=metadata))
+        if dataset.steps:
+            changes.insert(-1, _with_steps_as_times)
         metadata = replace(metadata, dt=options.resample, sequence_length=UNKNOWN_LENGTH)
         notes = (*notes, f"Positions are interpolated to frames that are {options.resample:g} apart in time.")
     if options.smooth is not None:
@@ -63,14 +75,54 @@ def _apply(
         yield trajectory
 
 
+def _without_times(trajectory: Trajectory) -> Trajectory:
+    """The trajectory without recorded times, which a stated time between frames overrules."""
+    return replace(trajectory, fields={name: values for name, values in trajectory.fields.items() if name != "time"})
+
+
+def _with_steps_as_times(trajectory: Trajectory) -> Trajectory:
+    """The trajectory with times in place of numbers of steps, where velocities tell how long a step is."""
+    numbers, by_velocity = recorded_times(trajectory), step_by_velocities([take_sample(trajectory)])
+    if numbers is None or by_velocity is None:
+        return trajectory
+    return replace(trajectory, fields=trajectory.fields | {"time": numbers * (by_velocity / usual_step(numbers))})
+
+
 def _resample_stored(trajectory: Trajectory, dt: float | None, step: float, metadata: Metadata) -> Trajectory:
-    frames = len(trajectory.position)
-    time = trajectory.fields.get("time")
-    if time is None or time.shape != (frames,):
+    time = recorded_times(trajectory)
+    if time is None:
         if dt is None:
             raise DataError("Frames without times cannot be resampled: state the time between them (--dt).")
-        time = dt * np.arange(frames)
-    return resample(trajectory, np.asarray(time, dtype=np.float64), step, metadata)
+        time = dt * np.arange(len(trajectory.position))
+    return resample(*_in_order(trajectory, time), step, metadata)
+
+
+def _in_order(trajectory: Trajectory, time: np.ndarray) -> tuple[Trajectory, np.ndarray]:
+    """The trajectory and its (T,) times without frames that are no data, and those that a restart has written again.
+
+    Particles that are absurdly far away are absent.
+
+    Raises:
+        DataError: if there is more than one run in it.
+    """
+    good = np.flatnonzero(~broken_frames(trajectory.position) & np.isfinite(time))
+    if not len(good):
+        raise DataError("In all frames all particles are at one point.")
+    kept = good[increasing_frames(time[good])]
+    if 2 * len(kept) <= len(good):
+        fault = find_time_fault(time[good])
+        raise DataError(f"Frames cannot be put in order: {fault.sentence} {fault.remedy}" if fault else "")
+    if left_out := len(time) - len(kept):
+        _log.warning(
+            "%s left out: particles at one point or far away, or without a time (%d), times that do not increase (%d).",
+            counted(left_out, "frame"), len(time) - len(good), len(good) - len(kept),
+        )  # fmt: skip
+        trajectory = take_frames(trajectory, kept)
+    if (far := particles_far_away(trajectory.position)).any():
+        _log.warning("%s far away: absent there.", counted(int(far.any(axis=0).sum()), "particle"))
+        position = np.where(far[..., None], np.float32(np.nan), trajectory.position)
+        trajectory = replace(trajectory, position=position)
+    return trajectory, time[kept]
 
 
 def resample(trajectory: Trajectory, time: np.ndarray, step: float, metadata: Metadata) -> Trajectory:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from nmpm.data.array_checks import broken_frames, particles_far_away
 from nmpm.data.facts.boundaries import Axis, Ends, boundary_fact, bounds_fact, domain_fact, find_axes
 from nmpm.data.facts.fact import Fact, Facts
 from nmpm.data.facts.free_fall import Track, find_gravity
@@ -18,6 +19,7 @@ from nmpm.data.facts.volume import find_particle_volume
 from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.gravity import Gravity
 from nmpm.data.statistics import Extent
+from nmpm.data.times import take_frames
 from nmpm.errors import DataError
 from nmpm.scene import Boundary
 
@@ -32,6 +34,7 @@ class FactFinder:
         dt: Time between frames, where it is known; else it is found.
         obstacles: Types that are known to be obstacles, beside those that are found.
         boundary: The kind of boundary of each axis, where it is known; the domain depends on it.
+        steps: Whether recorded times are numbers of a simulator's steps.
     """
 
     def __init__(
@@ -40,14 +43,21 @@ class FactFinder:
         dt: float | None = None,
         obstacles: frozenset[int] = frozenset(),
         boundary: Sequence[Boundary] | None = None,
+        steps: bool = False,
     ) -> None:
+        self._steps = steps
         self.dim, self._dt, self._obstacles, self._boundary = dim, dt, obstacles, boundary
         self._extents: dict[int, Extent] = {}  # by type
         self._motion, self._samples, self._times = TypeMotion(), Samples(), TimeSteps()
         self._frames: set[int] = set()
 
     def add(self, trajectory: Trajectory) -> None:
-        """Adds a trajectory."""
+        """Adds a trajectory, without frames and particles that are no data."""
+        if (broken := broken_frames(trajectory.position)).any() and not broken.all():
+            trajectory = take_frames(trajectory, np.flatnonzero(~broken))
+        if (lost := particles_far_away(trajectory.position).any(axis=0)).any():
+            kept = {name: trajectory.fields[name] for name in ("time",) if name in trajectory.fields}
+            trajectory = Trajectory(trajectory.position[:, ~lost], trajectory.particle_type[~lost], {}, kept)
         position, types = trajectory.position, trajectory.particle_type
         self._frames.add(len(position))
         self._times.add(trajectory)
@@ -61,6 +71,11 @@ class FactFinder:
         self._motion.add(types, present, path_extents(position), mean_spacing(low[present], high[present]))
         self._samples.add(trajectory)
 
+    @property
+    def recorded_step(self) -> float | None:
+        """The usual step of recorded times; None where there are none."""
+        return self._times.usual
+
     def facts(self) -> Facts:
         """The facts; raises a DataError if no particle was ever there."""
         if not self._extents:
@@ -73,7 +88,7 @@ class FactFinder:
         materials = moving - prescribed.value
         if prescribed.value:
             volume = find_particle_volume(self._samples, materials)
-        spacing, dt = self._spacing(volume), self._times.fact(tuple(self._samples))
+        spacing, dt = self._spacing(volume), self._times.fact(tuple(self._samples), self._steps)
         beyond = self._extent(types - materials) if materials < types else None
         axes, openings = find_axes(self._paths(materials), self._extent(materials), beyond, spacing)
         bounds, boundary = bounds_fact(axes, spacing), boundary_fact(axes, openings)

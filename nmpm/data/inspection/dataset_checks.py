@@ -11,10 +11,10 @@ from nmpm.data.facts.obstacles import never_moving, path_extents
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.inspection import comparisons
-from nmpm.data.inspection.findings import Finding
-from nmpm.data.inspection.irregular_motion import find_disorder, find_irregular_motion, find_noise
+from nmpm.data.inspection.findings import Finding, Severity
+from nmpm.data.inspection.irregular_motion import find_broken_frames, find_disorder, find_irregular_motion, find_noise
 from nmpm.data.inspection.motion import Motion, spacing_of
-from nmpm.data.inspection.stated import check_stated, find_odd_particles, free_fall
+from nmpm.data.inspection.stated import check_stated, find_odd_particles, find_time_faults, free_fall
 from nmpm.data.statistics import Extent
 from nmpm.data.times import recorded_step
 from nmpm.data.volumes import VOLUME
@@ -51,10 +51,12 @@ class DatasetChecks:
         self._walls.add(trajectory.position[:, self.metadata.is_static(trajectory.particle_type)])
         if not motion.present.any():
             return
+        for find in (find_broken_frames, find_time_faults, find_disorder):
+            causes = list(find(motion))
+            self._findings += causes
+            if any(cause.severity == Severity.CONTRADICTION for cause in causes):
+                return  # everything else that would be found are its symptoms
         self._extent.add(motion.position)
-        if disorder := list(find_disorder(motion)):  # then everything else that would be found means nothing
-            self._findings += disorder
-            return
         irregular = list(find_irregular_motion(motion))
         self._findings += [*find_odd_particles(motion), *irregular, *(() if irregular else find_noise(motion))]
         try:

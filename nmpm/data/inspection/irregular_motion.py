@@ -7,6 +7,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from nmpm._support.messages import counted
+from nmpm.data.array_checks import broken_frames, frames_at_one_point, particles_far_away
 from nmpm.data.inspection.findings import Finding, Severity
 from nmpm.data.inspection.motion import Motion, lengths
 from nmpm.data.statistics import relative_positions
@@ -41,6 +43,33 @@ def find_irregular_motion(motion: Motion) -> Iterator[Finding]:
         yield from find_jumps(motion)
         yield from find_repeated_frames(motion)
         yield from find_missing_frames(motion)
+
+
+def find_broken_frames(motion: Motion) -> Iterator[Finding]:
+    """Yields findings about frames with all particles at one point, and about particles absurdly far away."""
+    empty, far = frames_at_one_point(motion.position), particles_far_away(motion.position)
+    overflowed = broken_frames(motion.position) & ~empty
+    lost = far & ~overflowed[:, None]
+    remedy = f"Leave out what is no data: nmpm convert FOLDER NEW --resample {motion.metadata.dt:.6g}."
+    if empty.all():
+        remedy = "Are these the positions?"
+    for kind, what, wrong in (
+        ("empty frames", "all particles are at one point, {}", empty[:, None] & motion.present),
+        ("overflowed frames", "particles are absurdly far away, e.g. at {}", far & overflowed[:, None]),
+        ("lost particles", "it is absurdly far away, at {}", lost),
+    ):
+        if wrong.any():
+            frame, index = map(int, np.argwhere(wrong)[0])
+            frames, particles = (int(wrong.any(axis=axis).sum()) for axis in (1, 0))
+            many = f"{counted(frames, 'frame')}, {counted(particles, 'particle')}"
+            yield Finding(
+                kind,
+                Severity.CONTRADICTION,
+                f"{what.format(motion.position[frame, index].tolist())} ({many} in all). {remedy}",
+                motion.where,
+                f"frame {frame}{f', particle {motion.index[index]}' if wrong is lost else ''}",
+                badness=float(wrong.mean()),
+            )
 
 
 def find_disorder(motion: Motion) -> Iterator[Finding]:

@@ -14,6 +14,7 @@ from nmpm.scene import Interval
 
 _MASK_CELLS = 64
 _FRAMES_ON_GRIDS = 12
+_FAR = 2**40  # cells: overflowed positions are no integers
 _REST = 0.02  # of a trajectory's peak speed
 _BINS = np.geomspace(1e-9, 1e2, 1101)  # of speeds, in longest sides per frame; 2.3% wide
 
@@ -84,7 +85,7 @@ class Measurements:
         """Flat index of the cell that contains each of (N, D) particles that are there, (N',)."""
         shape = np.array(self.shape(cells))
         position = position[~np.isnan(position[:, 0])]
-        index = np.floor((position - self.low) / self.extent * shape).astype(int)
+        index = np.clip(np.floor((position - self.low) / self.extent * shape), -_FAR, _FAR).astype(int)
         index = np.where(self.metadata.periodic, index % shape, np.clip(index, 0, shape - 1))
         return np.asarray(np.ravel_multi_index(tuple(index.T), tuple(shape)))
 

@@ -68,10 +68,12 @@ def find_contradictions(source: FolderSource) -> tuple[Finding, ...]:
 
 
 def _read_start(split: Split, index: int) -> Trajectory:
-    """The frames of a trajectory up to about 4 MiB, with their times where these are recorded."""
+    """The frames of a trajectory up to about 4 MiB, with their times and velocities where these are recorded."""
     frames = max(_FRAMES, _BYTES // (4 * split.particles(index) * split.dim))
     trajectory = split.read(index, 0, min(frames, split.frames(index)))
     with open_hdf5(split.path) as file:
-        time = file[split.names[index]].get("time")
-        recorded = {} if time is None else {"time": np.asarray(time[: len(trajectory.position)])}
+        group = file[split.names[index]]
+        recorded = {
+            name: np.asarray(group[name][: len(trajectory.position)]) for name in ("time", "velocity") if name in group
+        }
     return replace(trajectory, fields=recorded)

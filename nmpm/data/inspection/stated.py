@@ -10,11 +10,13 @@ import numpy as np
 from nmpm._support.messages import counted
 from nmpm.data.facts import FOUND
 from nmpm.data.facts.free_fall import Track, find_gravity
+from nmpm.data.facts.sample import take_sample
+from nmpm.data.facts.timing import step_by_velocities
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.inspection.findings import Finding, Severity
 from nmpm.data.inspection.motion import Motion, spacing_of
 from nmpm.data.statistics import first_moving_particle, first_outside
-from nmpm.data.times import recorded_step, uneven_step
+from nmpm.data.times import find_time_fault, recorded_step, recorded_times
 from nmpm.data.volumes import VOLUME
 
 _FIRST_STEPS = 32  # in which particles are looked for that fly freely
@@ -45,7 +47,7 @@ def free_fall(motion: Motion) -> tuple[float, ...] | None:
 
 def check_stated(motion: Motion) -> Iterator[Finding]:
     """Yields contradictions between the metadata and one trajectory: time step, gravity, particle volume."""
-    yield from check_times(motion)
+    yield from check_dt(motion)
     yield from check_gravity(motion)
     yield from check_volume(motion)
 
@@ -58,36 +60,79 @@ def find_odd_particles(motion: Motion) -> Iterator[Finding]:
     yield from find_absences(motion)
 
 
-def check_times(motion: Motion) -> Iterator[Finding]:
-    """Yields findings about the recorded times of frames: uneven steps, or another one than stated."""
-    dt = recorded_step(motion.trajectory)
-    if dt is None:
+def find_time_faults(motion: Motion) -> Iterator[Finding]:
+    """Yields a finding about recorded times of frames that are not even."""
+    time = recorded_times(motion.trajectory)
+    fault = None if time is None else find_time_fault(time)
+    if fault is None:
         return
-    time = np.asarray(motion.trajectory.fields["time"], dtype=np.float64)
-    if (uneven := uneven_step(time)) is not None:
-        frame, factor = uneven
-        differing = int((np.abs(np.diff(time) / dt - 1) > _UNEVEN).sum())
+    mend = fault.remedy
+    if mend.startswith("--"):
+        mend = f"Interpolate: nmpm convert FOLDER NEW {mend}."
+    if fault.jitter:
+        mend += " Or take them as even by --dt in place of --resample."
+    yield Finding(
+        "uneven time steps",
+        Severity.ODDITY if fault.jitter else Severity.CONTRADICTION,
+        f"{fault.sentence} {mend}",
+        motion.where,
+        f"frame {fault.frame}",
+        fault.factor,
+        badness=abs(fault.factor - 1),
+    )
+
+
+def check_dt(motion: Motion) -> Iterator[Finding]:
+    """Yields a finding if dt is not the step of recorded times, or if recorded velocities suit another one.
+
+    Recorded times say what dt is. Without any, particles that fall by the stated gravity confirm it, and velocities
+    that disagree are in another unit.
+    """
+    stated, dt = motion.metadata.dt, recorded_step(motion.trajectory)
+    by_velocity = step_by_velocities([take_sample(motion.trajectory)] if "velocity" in motion.trajectory.fields else [])
+    if dt is not None and abs(stated / dt - 1) > _UNEVEN and not _same(by_velocity, stated):
+        yield _wrong_dt(motion, dt, "the recorded times of frames are {} apart")
+    elif by_velocity is not None and not (_same(by_velocity, stated) or _same(by_velocity, 1.0)):
+        if dt is None and "dt" not in motion.metadata.extra.get(FOUND, {}) and not _falls_by_gravity(motion):
+            yield _wrong_dt(motion, by_velocity, "recorded velocities are displacements over {}")
+            return
+        by = "recorded times" if dt is not None else "the stated gravity" if _falls_by_gravity(motion) else "dt"
         yield Finding(
-            "uneven time steps",
-            Severity.CONTRADICTION,
-            f"it comes {factor:.3g} time steps of {dt:.4g} after the one before; {differing} of {len(time) - 1} steps"
-            " differ.",
+            "unit of velocities",
+            Severity.NOTE,
+            f"recorded velocities are displacements over {by_velocity:.4g}, frames are {stated:.4g} apart by {by};"
+            " models use positions alone. For the velocities' unit of time: nmpm convert FOLDER NEW --dt"
+            f" {by_velocity:.6g}.",
             motion.where,
-            f"frame {frame}",
-            factor,
-            badness=abs(factor - 1),
+            factor=stated / by_velocity,
         )
+
+
+def _wrong_dt(motion: Motion, dt: float, reason: str) -> Finding:
+    """The contradiction that dt is another one; `reason` says why, with a place for it."""
     factor = motion.metadata.dt / dt
-    if abs(factor - 1) > _UNEVEN:
-        yield Finding(
-            "dt",
-            Severity.CONTRADICTION,
-            f"dt is stated as {motion.metadata.dt:.4g}, {too(factor)}: the recorded times of frames are {dt:.4g} apart."
-            f" {correction(f'--dt {dt:.6g}')}",
-            motion.where,
-            factor=factor,
-            badness=abs(math.log(factor)),
-        )
+    return Finding(
+        "dt",
+        Severity.CONTRADICTION,
+        f"dt is stated as {motion.metadata.dt:.4g}, {too(factor)}: {reason.format(f'{dt:.4g}')}."
+        f" {correction(f'--dt {dt:.6g}')}",
+        motion.where,
+        factor=factor,
+        badness=abs(math.log(factor)),
+    )
+
+
+def _same(one: float | None, other: float) -> bool:
+    return one is not None and abs(one / other - 1) < _SAME_NUMBER
+
+
+def _falls_by_gravity(motion: Motion) -> bool:
+    """Whether particles fall freely by the stated gravity, which then confirms dt."""
+    stated, fall = trajectory_gravity(motion.trajectory.attributes, motion.metadata, motion.where), free_fall(motion)
+    if stated is None or "gravity" in motion.metadata.extra.get(FOUND, {}) or fall is None or not any(fall):
+        return False
+    measured = np.asarray(fall) / motion.metadata.dt**2
+    return bool(np.linalg.norm(np.asarray(stated) - measured) < (_DIFFERENT - 1) * np.linalg.norm(measured))
 
 
 def check_gravity(motion: Motion) -> Iterator[Finding]:

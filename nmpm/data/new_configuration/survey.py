@@ -17,7 +17,7 @@ from nmpm.data.inspection.measurements import Measurements
 from nmpm.data.loading.sources import FolderSource
 from nmpm.data.split_files import find_split, split_paths
 from nmpm.data.statistics import displacements
-from nmpm.data.times import uneven_step
+from nmpm.data.times import uneven_step, usual_step
 from nmpm.scene import Scene
 
 TRAJECTORIES = 8
@@ -84,7 +84,7 @@ def survey(source: FolderSource) -> Survey:
             measured.add(trajectory)
             time = split.time(index)
             if time is not None and uneven_step(time) is not None:
-                facts.uneven = float(np.median(np.diff(time)))
+                facts.uneven = usual_step(time)
             _add(facts, trajectory, metadata, replace(scene, gravity=gravity))
             advance()
     facts.rests = sum(rest is not None for rest in measured.rests)

@@ -1,6 +1,7 @@
 """LAMMPS's text dumps, by hand and by ase."""
 
 import gzip
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import pytest
 
 from nmpm.data.convert import Options, convert
 from nmpm.data.format import Split, read_metadata
+from nmpm.data.inspection import inspect
+from nmpm.data.loading.sources import FolderSource
 from nmpm.errors import DataError
 
 T, N = 6, 5
@@ -108,7 +111,7 @@ def test_coordinates_are_those_in_the_box(tmp_path, columns, row):
     trajectory, metadata = Split(tmp_path / "out" / "train.h5").read_with_fields(0), read_metadata(tmp_path / "out")
     np.testing.assert_allclose(trajectory.position[1], [[1, 0.5]] * 2 if metadata.dim == 2 else [[1, 0.5, 0]] * 2)
     assert metadata.boundary[:2] == ("periodic", "wall")
-    assert not trajectory.fields
+    assert set(trajectory.fields) == {"time"}
 
 
 def test_times_elements_and_further_columns(tmp_path):
@@ -196,3 +199,35 @@ def test_recorded_grains(recorded, tmp_path):
     bed = trajectory.position[:, trajectory.particle_type == 3]
     assert (bed == bed[0]).all()
     assert len(Split(tmp_path / "out" / "train.h5")) == 8
+
+
+def falling(path: Path, steps: list[int], columns: str) -> None:
+    """A cloud that falls, frames at some numbers of steps of 2e-4; z is the time of a frame."""
+    start, text = 20 + np.random.default_rng(0).random((40, 2)), ""
+    for step in steps:
+        time = 2e-4 * step
+        position = start - np.array([0, 9.81 / 2 * time**2])
+        rows = [(i + 1, 1, *position[i], 0, 0.0, -9.81 * time)[: len(columns.split())] for i in range(40)]
+        text += frame_text(step, rows, columns, "ss ss pp")
+    path.write_text(text)
+
+
+@pytest.mark.parametrize(("columns", "dt"), [("id type x y z", 100.0), ("id type x y z vx vy", 0.02)])
+def test_steps_are_times_in_units_of_a_step_or_as_long_as_velocities_tell(tmp_path, columns, dt):
+    falling(tmp_path / "a.lammpstrj", list(range(0, 3000, 100)), columns)
+    convert(tmp_path / "a.lammpstrj", tmp_path / "native")
+    metadata, split = read_metadata(tmp_path / "native"), Split(tmp_path / "native" / "train.h5")
+    assert metadata.dt == pytest.approx(dt, rel=1e-6)
+    np.testing.assert_allclose(split.time(0), dt * np.arange(30), atol=1e-9)
+    assert metadata.gravity == pytest.approx((0, -9.81 * (0.02 / dt) ** 2), rel=1e-3)
+
+
+@pytest.mark.parametrize("columns", ["id type x y z", "id type x y z vx vy"])
+def test_uneven_steps_are_found_and_the_printed_command_mends_them(tmp_path, columns):
+    falling(tmp_path / "a.lammpstrj", [*range(0, 1000, 100), *range(800, 2000, 100)], columns)
+    convert(tmp_path / "a.lammpstrj", tmp_path / "native")
+    finding = next(each for each in inspect(FolderSource(tmp_path / "native")).findings if each.severity != "note")
+    assert (finding.kind, finding.details) == ("uneven time steps", "frame 10")
+    resample = float(re.search(r"--resample (\S+)\.$", finding.sentence)[1])
+    convert(tmp_path / "a.lammpstrj", tmp_path / "mended", options=Options(resample=resample))
+    assert not [each for each in inspect(FolderSource(tmp_path / "mended")).findings if each.severity != "note"]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from nmpm.cli import main
 from nmpm.data.format import Metadata, Trajectory, write_metadata, write_split
 from nmpm.data.inspection import inspect
 from nmpm.data.inspection.comparisons import compare_domains
@@ -173,7 +174,54 @@ def absent(run: np.ndarray) -> np.ndarray:
     return run
 
 
+def unwritten(run: np.ndarray) -> np.ndarray:
+    run[-4:] = 0
+    return run
+
+
+def unwritten_within(run: np.ndarray) -> np.ndarray:
+    run[12] = 0
+    return run
+
+
+def overflowed(run: np.ndarray) -> np.ndarray:
+    run[-4:] *= 1e25
+    return run
+
+
+def lost(run: np.ndarray) -> np.ndarray:
+    run[20:, 5] = 1e6
+    return run
+
+
+def record(data: Data, time: np.ndarray, frames: np.ndarray, velocity_unit: float = 0.0) -> None:
+    """Keeps some frames of all runs, at times that are recorded; with velocities, in some unit of time."""
+    data.change_all(lambda run: run[frames])
+    data.fields["time"] = time
+    if velocity_unit:
+        data.fields["velocity"] = np.gradient(data.runs["train"][0], DT / velocity_unit, axis=0)
+
+
 ONE = slice(2, 3)
+EVERY, TIME = np.arange(FRAMES), DT * np.arange(FRAMES)
+RESTART = np.r_[0:20, 14:FRAMES]
+REPEAT = np.sort(np.r_[EVERY, 9])
+JITTERED = TIME + 0.02 * DT * np.random.default_rng(0).uniform(-1, 1, FRAMES)
+CAUSES: dict[str, tuple[Callable[[Data], object], str]] = {
+    "unwritten frames": (lambda data: data.change(unwritten, ONE), "empty frames: .*frame 28: .*4 frames"),
+    "unwritten frames everywhere": (lambda data: data.change_all(unwritten), "empty frames: in 5 of 5"),
+    "an unwritten frame": (lambda data: data.change(unwritten_within, ONE), "empty frames: .*frame 12: .*1 frame,"),
+    "overflow": (lambda data: data.change(overflowed, ONE), "overflowed frames: .*frame 28"),
+    "a lost particle": (lambda data: data.change(lost, ONE), "lost particles: .*frame 20, particle 5"),
+    "restart": (lambda data: record(data, TIME[RESTART], RESTART), "uneven .*go back in frame 20, from 0.19 to 0.14"),
+    "repeated times": (lambda data: record(data, TIME[REPEAT], REPEAT), "uneven .*repeat: 1 frame .* frame 10"),
+    "missing frames": (lambda data: record(data, np.delete(TIME, [8, 20]), np.delete(EVERY, [8, 20])),
+                       "uneven .*2 of 29 steps differ"),
+    "jitter": (lambda data: data.fields.update(time=JITTERED), "uneven .*by up to 3.5% around their mean, 0.00999"),
+    "dt beside velocities": (lambda data: (record(data, TIME, EVERY, 1), data.fields.pop("time"),
+                                           data.state(dt=10 * DT, gravity=None)),
+                             "dt: .*10 times too large: recorded velocities are displacements over 0.01"),
+}  # fmt: skip
 UNEVEN = DT * (np.arange(FRAMES) + (np.arange(FRAMES) > 9))
 LIES: dict[str, tuple[Callable[[Data], object], str, float | None]] = {
     "gravity up": (lambda data: data.state(gravity=(0.0, GRAVITY)), "opposite direction", 1),
@@ -235,6 +283,27 @@ def test_a_lie_is_the_first_finding(lie, data, tmp_path):
     assert re.search(words, str(first)), (first, others)
     if factor is not None:
         assert first.factor == pytest.approx(factor, rel=0.08)
+
+
+@pytest.mark.parametrize("cause", CAUSES)
+def test_the_printed_command_mends_the_only_finding(cause, data, tmp_path):
+    tell, words = CAUSES[cause]
+    tell(data)
+    (finding,) = [each for each in data.findings(tmp_path / "data") if each.severity != Severity.NOTE]
+    assert re.search(words, str(finding)), finding
+    (options,) = re.findall(r"nmpm convert FOLDER NEW ([^;]*?)\.(?: |$)", finding.sentence)
+    main(["convert", str(tmp_path / "data"), str(tmp_path / "new"), *options.split()])
+    again = inspect(FolderSource(tmp_path / "new")).findings
+    assert [str(each) for each in again if each.severity != Severity.NOTE] == []
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 60.0], ids=["s", "ms", "min"])
+def test_times_and_velocities_of_other_units_are_a_note(unit, data, tmp_path):
+    record(data, TIME / unit, EVERY, velocity_unit=1)
+    data.state(dt=DT / unit, gravity=(0.0, -GRAVITY * unit**2))
+    findings = data.findings(tmp_path)
+    assert [finding.severity for finding in findings] == ([] if unit == 1 else [Severity.NOTE])
+    assert all(f"frames are {DT / unit:.4g} apart by recorded times" in finding.sentence for finding in findings)
 
 
 def test_other_units_change_no_finding(data, tmp_path):

@@ -3,11 +3,15 @@
 import csv
 import time
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from nmpm.data.format import Metadata, Split, Trajectory
+from nmpm.data.convert import convert
+from nmpm.data.format import Metadata, Split, Trajectory, read_metadata
 from nmpm.data.write import WRITERS, find_writer
 from nmpm.data.write.frames import fields_left_out
 from nmpm.errors import ConfigError
@@ -135,6 +139,24 @@ def test_native_files_bring_their_scene_along(tmp_path, suffix, trajectory):
     if not np.isnan(trajectory.position).any():
         shown = read_labelled(split)
         assert (list(shown.positions), shown.dt, shown.materials) == (["recorded"], DT, ("fresh water",))
+
+
+@pytest.mark.parametrize("suffix", sorted({*WRITERS} - {".usda"}))
+@settings(max_examples=6, deadline=None)
+@given(dt=st.floats(1e-6, 1e4), dim=st.sampled_from([2, 3]))
+def test_what_is_read_back_has_the_same_time_step(suffix, dt, dim):
+    """Though velocities that nobody recorded are differences of positions, and gravity accelerates."""
+    if suffix in (".vtp", ".pvd"):
+        pytest.importorskip("pyvista")
+    frames = np.arange(20)[:, None, None]
+    fall = np.random.default_rng(0).uniform(4, 5, (1, 30, dim)) + 0.01 * frames - 0.002 * frames**2
+    metadata = Metadata(((0, 6),) * dim, dt, dim, 19, {0: "sand"})
+    with TemporaryDirectory() as folder:
+        written = find_writer("--out", Path(folder) / f"out{suffix}").write(
+            Path(folder) / f"out{suffix}", Trajectory(fall.astype(np.float32), np.zeros(30, int)), metadata
+        )
+        convert(written, Path(folder) / "again")
+        assert read_metadata(Path(folder) / "again").dt == pytest.approx(dt, rel=1e-8)
 
 
 def test_fields_that_frames_cannot_have_are_named():
