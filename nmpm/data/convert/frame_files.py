@@ -77,11 +77,11 @@ class FrameFormat(DatasetFormat):
     """Abstract reader of a format whose files contain one frame, or many, one subclass per format.
 
     Attributes:
-        listing: Of the names of files that list the frames of a run; where there is one, others are only read by it.
+        listings: Of the names of files that list the frames of a run; where there is one, others are only read by it.
         signature: Bytes that files begin with, by which they are recognised where their names have no usual suffix.
     """
 
-    listing: ClassVar[str] = ""
+    listings: ClassVar[tuple[str, ...]] = ()
     signature: ClassVar[bytes] = b""
 
     @abc.abstractmethod
@@ -124,7 +124,7 @@ class FrameFormat(DatasetFormat):
             return
         for folder, inner, names in os.walk(path):
             names = [name for name in names if not is_no_data(name)]
-            lists = fnmatch.filter(names, self.listing)
+            lists = next(filter(None, (fnmatch.filter(names, pattern) for pattern in self.listings)), [])
             inner.sort(key=lambda name: number_order(Path(name)))
             inner[:] = [name for name in inner if not is_no_data(name) and not lists]
             if len(Path(folder).relative_to(path).parts) >= _DEPTH:

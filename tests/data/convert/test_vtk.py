@@ -1,5 +1,6 @@
 """Files that vtk writes, by pyvista."""
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -52,17 +53,22 @@ def test_points_arrays_and_times_are_read(tmp_path, suffix, binary):
     assert read_metadata(tmp_path / "out").dt == 0.5
 
 
-def write_list(folder: Path, names: list[str], times: list[float]) -> Path:
+def write_list(folder: Path, names: list[str], times: list[float], suffix: str = ".pvd") -> Path:
+    path = folder / f"run{suffix}"
+    if suffix == ".vtp.series":
+        files = [{"name": name, "time": time} for time, name in zip(times, names, strict=True)]
+        path.write_text(json.dumps({"file-series-version": "1.0", "files": files}))
+        return path
     sets = "".join(f'<DataSet timestep="{t}" part="0" file="{name}"/>' for t, name in zip(times, names, strict=True))
-    path = folder / "run.pvd"
     path.write_text(f'<?xml version="1.0"?><VTKFile type="Collection"><Collection>{sets}</Collection></VTKFile>')
     return path
 
 
-def test_a_list_gives_order_and_times(tmp_path):
+@pytest.mark.parametrize("suffix", [".pvd", ".vtp.series"])
+def test_a_list_gives_order_and_times(tmp_path, suffix):
     position = write_run(tmp_path / "run" / "frames")
-    write_list(tmp_path / "run", [f"frames/frame_{t}.vtp" for t in (3, 0, 2)], [0.3, 0.1, 0.2])
-    for source in (tmp_path / "run", tmp_path / "run" / "run.pvd"):
+    written = write_list(tmp_path / "run", [f"frames/frame_{t}.vtp" for t in (3, 0, 2)], [0.3, 0.1, 0.2], suffix)
+    for source in (tmp_path / "run", written):
         convert(source, tmp_path / source.name / "out")
         trajectory = Split(tmp_path / source.name / "out" / "train.h5").read_with_fields(0)
         np.testing.assert_array_equal(trajectory.position, position[[0, 2, 3]])
@@ -84,6 +90,13 @@ def declare_more(path: Path) -> None:
 
 def declare_fewer_than_none(path: Path) -> None:
     path.write_bytes(path.read_bytes().replace(b'OfPoints="7"', b'OfPoints="-7"'))
+
+
+@pytest.mark.parametrize("content", ["[1", "[]", '{"files": [1]}', '{"files": [{"name": "a.vtp", "time": "x"}]}'])
+def test_a_series_that_is_none_is_named(tmp_path, content):
+    (tmp_path / "a.vtp.series").write_text(content)
+    with pytest.raises(DataError, match=r"a.vtp.series: cannot be read as a list .*; its files need name and time"):
+        convert(tmp_path / "a.vtp.series", tmp_path / "out")
 
 
 @pytest.mark.parametrize(
