@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self
 
@@ -247,6 +247,18 @@ class Emulator(nn.Module):
         if mode:
             self.recorded_calls = RecordedCalls()
         return super().train(mode)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """As torch's; raises ConfigError for types less precise than float32."""
+        dtype = fn(self.input_mean.new_empty(0)).dtype
+        if torch.promote_types(dtype, torch.float32) != dtype:
+            name = str(dtype).removeprefix("torch.")
+            raise ConfigError(
+                f"In {name} an emulator's positions would be off by whole cells. Convert the network alone,"
+                " model.with_network('bfloat16') or emulator.with_network(torch.bfloat16), or train by"
+                " Trainer(precision='bf16-mixed')."
+            )
+        return super()._apply(fn, recurse)  # type: ignore[no-untyped-call,no-any-return]  # (torch's own)
 
     def normalise(self, state: Tensor) -> Tensor:
         """The processor's input for a grid state (B, C_in, *S) in grid units."""

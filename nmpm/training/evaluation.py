@@ -9,6 +9,7 @@ from lightning.pytorch import LightningModule
 from torch import Tensor
 
 from nmpm.emulator import Emulator, Prescribed, Rollout, predict_rollout
+from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import Comparison
 from nmpm.evaluation.ensembles import EnsembleTest
 from nmpm.metrics import MSE, RolloutMetric, overall_error
@@ -19,6 +20,16 @@ from nmpm.training.preflight import OVERALL
 
 VALIDATED = 4
 """Members of each scene in validations of ensembles."""
+
+
+def check_window(batch: object) -> Window:
+    """The batch; raises ConfigError if another loader than nmpm's has made it."""
+    if isinstance(batch, Window):
+        return batch
+    raise ConfigError(
+        f"The loader's batches are of the type {type(batch).__name__}, not nmpm.particles.Window: give the Trainer a"
+        " datamodule, nmpm.TrajectoryDataModule(path=...), or a DataLoader of windows."
+    )
 
 
 class EvaluatedModule(LightningModule):
@@ -61,6 +72,9 @@ class EvaluatedModule(LightningModule):
         self.reading = getattr(getattr(self.trainer, "datamodule", None), "reading", plain)
         for errors in (self.valid_errors, self.test_errors):
             errors.count_every(self.reading.every)
+
+    def on_before_batch_transfer(self, batch: object, dataloader_idx: int) -> object:  # noqa: ARG002
+        return check_window(batch)
 
     def validation_step(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
         predicted = self._predict(batch)

@@ -36,7 +36,7 @@ from nmpm.training import checkpoints, preflight
 from nmpm.training.augmentation import check_jitter, check_mirrors, mirror_half, noisy_start, with_jitter
 from nmpm.training.backpropagation import direct, error_of_rows, mean_over_parts, predict_window
 from nmpm.training.budget import Clock, check_end, total_steps
-from nmpm.training.evaluation import EvaluatedModule
+from nmpm.training.evaluation import EvaluatedModule, check_window
 from nmpm.training.losses import counted
 from nmpm.training.optimization import OptimizerCallable, Schedule, adam, build_optimizer, with_learning_rate
 from nmpm.training.recorded_steps import MULTIPLE, RecordedSteps, can_record
@@ -277,7 +277,7 @@ class EmulatorModule(EvaluatedModule):
             self.trainer.fit_loop.setup_data()
             loader: Iterable[Window] = self.trainer.train_dataloader  # type: ignore[assignment]  # (loaded)
             set_statistics = calibrate_unread if self.emulator.calibrated else calibrate
-            set_statistics(self.emulator, list(islice(loader, CALIBRATION_BATCHES)))
+            set_statistics(self.emulator, [check_window(batch) for batch in islice(loader, CALIBRATION_BATCHES)])
         self._configured, self._rate_changed = True, False
         optimizer = build_optimizer(self.make_optimizer, self.emulator.parameters())
         total = total_steps(self.trainer)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -29,6 +30,12 @@ def build_optimizer(make: OptimizerCallable, parameters: Iterable[Tensor]) -> Op
         raise
     except ValueError as error:
         raise ConfigError(f"model.optimizer does not take its arguments: {error}.") from error
+    closure = inspect.signature(optimizer.step).parameters.get("closure")
+    if closure is not None and closure.default is closure.empty:
+        raise ConfigError(
+            f"model.optimizer: {type(optimizer).__name__} searches along lines, and each training step draws other"
+            " windows: take nmpm.optimizers.SOAP, torch.optim.Adam or another optimizer of single gradients."
+        )
     for group in optimizer.param_groups:
         check_learning_rate(group.get("lr"))
     return optimizer

@@ -87,6 +87,17 @@ def test_a_network_in_bfloat16_moves_particles_in_float32():
     assert 0 < (exact.position - rough.position).abs().max() < 1e-3
 
 
+@pytest.mark.parametrize("convert", [
+    lambda model: model.half(), lambda model: model.bfloat16(), lambda model: model.to(torch.float16),
+    lambda model: torch.nn.Sequential(model).to("cpu", torch.bfloat16),
+])  # fmt: skip
+def test_an_emulator_in_half_precision_is_refused_and_left_as_it_is(convert):
+    emulator = emulator_of(box())
+    with pytest.raises(ConfigError, match=r"float16 .*with_network\('bfloat16'\).*bf16-mixed"):
+        convert(emulator)
+    assert {values.dtype for values in emulator.state_dict().values()} == {torch.float32, torch.bool}
+
+
 def test_rollouts_are_cut_to_the_frames_asked_for():
     particles, emulator = cloud(box()), small(box())
     whole = rollout(emulator, particles, 9)

@@ -221,3 +221,19 @@ def test_a_compiled_network_trains_to_the_same_weights_and_a_broken_compiler_is_
         trainer_of(tmp_path / name, 2).fit(module, data)
     assert_same_weights(plain, compiled)
     assert bool(complaints) != works
+
+
+@pytest.mark.parametrize("make", [lambda tensor: (tensor, tensor), lambda tensor: {"position": tensor}, lambda t: t])
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_batches_of_a_foreign_loader_are_refused(tmp_path, make_dataset, make, calibrated):
+    module = module_of(data_of(make_dataset()))
+    module.emulator.calibrated.fill_(calibrated)
+    loader = torch.utils.data.DataLoader([torch.zeros(6, 20, 2)], collate_fn=lambda rows: make(rows[0]))
+    with pytest.raises(ConfigError, match=r"type (tuple|dict|Tensor), not .*TrajectoryDataModule\(path"):
+        trainer_of(tmp_path, 2).fit(module, loader)
+
+
+def test_optimizers_that_evaluate_a_step_again_are_refused(tmp_path, make_dataset):
+    data = data_of(make_dataset())
+    with pytest.raises(ConfigError, match=r"LBFGS .*nmpm.optimizers.SOAP"):
+        trainer_of(tmp_path, 2).fit(module_of(data, optimizer=torch.optim.LBFGS), data)
