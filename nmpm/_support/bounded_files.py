@@ -46,7 +46,9 @@ NPZ_ERRORS: tuple[type[Exception], ...] = (
     KeyError,
     ValueError,
     TypeError,
+    ArithmeticError,
     MemoryError,
+    SyntaxError,
     tokenize.TokenError,
 )
 """Raised for damaged `.npz` files, by NumPy too."""

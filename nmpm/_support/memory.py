@@ -5,7 +5,24 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+from nmpm.errors import DataError
+
 _CGROUP = Path("/sys/fs/cgroup")
+_ALWAYS = 2**28
+"""Bytes for which nobody is asked."""
+
+
+def check_fits(frames: int, particles: int, values: int, where: str) -> None:
+    """Refuses, with a DataError, an array of so many values per particle and frame for which memory does not suffice.
+
+    Files of few bytes can ask for it, by frames that are far apart, or particles that are in few frames.
+    """
+    size = 4 * frames * particles * max(values, 1)
+    if size > _ALWAYS and size > free_memory():
+        raise DataError(
+            f"{where}: {frames:,} frames of {particles:,} particles need {size / 2**30:,.1f} GiB of memory,"
+            f" {free_memory() / 2**30:.1f} are free. Cut the run along time, or leave particles out."
+        )
 
 
 def free_memory() -> float:

@@ -233,7 +233,7 @@ class FileFormat(DatasetFormat):
 @contextmanager
 def readable(where: Path | str, kind: str, *errors: type[Exception]) -> Iterator[None]:
     """Turns errors of a file, these and the usual ones, into a DataError: it cannot be read as `kind`."""
-    kinds: tuple[type[Exception], ...] = (*errors, OSError, EOFError, ValueError, MemoryError)
+    kinds: tuple[type[Exception], ...] = (*errors, OSError, EOFError, ValueError, ArithmeticError, MemoryError)
     try:
         yield
     except NmpmError:

@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from nmpm._support.bounded_files import EXPANSION, check_regular, expansion_limit
+from nmpm._support.memory import check_fits
 from nmpm._support.messages import install, one_line
 from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options, located, readable
 from nmpm.data.format import Metadata, Trajectory
@@ -137,6 +138,7 @@ def _trajectory(frames: list[dict[str, Any]], path: Path) -> Trajectory:
         )
     fluid, first = np.stack(positions), frames[0]
     wall = _wall(first, fluid.shape[2], path)
+    check_fits(len(fluid), len(wall), fluid.shape[2], str(path))
     kinds = np.repeat([_FLUID, _WALL], [fluid.shape[1], len(wall)]).astype(np.int64)
     still = np.broadcast_to(wall, (len(fluid), *wall.shape))
     attributes: dict[str, Any] = {key: np.bytes_(value) for key, value in first.items() if isinstance(value, bytes)}

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from nmpm._support.memory import check_fits
 from nmpm._support.messages import one_line
 from nmpm.data.convert.frame import Frame, Layout, ParticleArrays
 from nmpm.data.convert.named_arrays import AXES, plain_name, type_ids
@@ -158,6 +159,7 @@ class FrameStack:
             self._frames = self._frames if frames <= self._frames else 2 * self._frames
             if particles > self._room:
                 self._room = particles + (particles // 2 if self._room else 0)
+            check_fits(self._frames, self._room, len(self._axes), self._first)
             for name, old in self._values.items():
                 self._values[name] = np.full((self._frames, self._room, *old.shape[2:]), np.nan, old.dtype)
                 self._values[name][: self._count, : old.shape[1]] = old[: self._count]

@@ -75,7 +75,7 @@ class Lammps(FrameFormat):
         return (f"Frames are {apart} steps of LAMMPS apart; if dt is not the time between them, state it: --dt.",)
 
 
-def _blocks(lines: Lines) -> Iterator[tuple[_Header, list[bytes]]]:
+def _blocks(lines: Lines) -> Iterator[tuple[_Header, bytes]]:
     """Yields the header and the lines of particles of each frame."""
     while (header := _header(lines)) is not None:
         yield header, lines.block(header.count, header.start)
@@ -119,7 +119,7 @@ def _interval(line: str) -> Interval:
     return low, high
 
 
-def _frame(header: _Header, block: Sequence[bytes], where: str) -> Frame:
+def _frame(header: _Header, block: bytes, where: str) -> Frame:
     try:
         columns = parse_columns(block, header.columns)
     except ValueError as error:

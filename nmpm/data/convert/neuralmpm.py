@@ -15,6 +15,7 @@ from typing import ClassVar
 import h5py
 import numpy as np
 
+from nmpm._support.memory import check_fits
 from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options, located, split_files
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
@@ -134,6 +135,7 @@ def _trajectory(content: dict[str, np.ndarray], material: int | None, path: Path
     moving, wall = _positions(content, "particles", path), _positions(content, "boundary", path)
     frames, particles, dim = moving.shape
     if wall.ndim == 2:
+        check_fits(frames, len(wall), dim, str(path))
         wall = np.broadcast_to(wall, (frames, *wall.shape))
     if wall.shape[0] != frames or wall.shape[2] != dim:
         raise DataError(f"{path}: particles {moving.shape} and boundary {wall.shape} do not match.")

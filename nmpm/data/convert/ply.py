@@ -35,9 +35,22 @@ class Ply(FrameFormat):
             import plyfile
         except ImportError as error:
             raise ConfigError(f"{file}: reading PLY needs plyfile: {install('vtk')}.") from error
-        with readable(file, "PLY", plyfile.PlyParseError):
+        with readable(file, "PLY", plyfile.PlyParseError, LookupError, TypeError):
+            _check_sizes(plyfile, file)
             content = plyfile.PlyData.read(str(file))
         yield _frame(content, file)
+
+
+def _check_sizes(plyfile: Any, file: Path) -> None:
+    """Raises ValueError if a file declares more rows than fit into it."""
+    size = file.stat().st_size
+    with file.open("rb") as stream:
+        header = plyfile.PlyData._parse_header(stream)
+    for element in header.elements:
+        row = 2 * len(element.properties) if header.text else element.dtype().itemsize  # (lists are pointers)
+        least = row if header.text or not any(hasattr(one, "len_dtype") for one in element.properties) else 1
+        if element.count * least > size + 1:
+            raise ValueError(f"it declares {element.count:,} rows of {element.name} but has {size:,} bytes")
 
 
 def _frame(content: Any, file: Path) -> Frame:

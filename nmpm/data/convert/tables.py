@@ -15,7 +15,7 @@ from nmpm._support.bounded_files import check_regular
 from nmpm._support.messages import install, one_line
 from nmpm._support.progress import progress_bar
 from nmpm.data.convert.base import readable
-from nmpm.data.convert.text_lines import Lines, is_number, open_lines
+from nmpm.data.convert.text_lines import Lines, is_number, open_lines, text_array
 from nmpm.errors import ConfigError, DataError
 
 SUFFIXES = ("*.csv", "*.csv.gz", "*.tsv", "*.tsv.gz", "*.txt", "*.txt.gz", "*.parquet")
@@ -142,7 +142,7 @@ def _column(cells: list[str], delimiter: str | None) -> np.ndarray:
 
     Decimal commas are points where cells have another delimiter.
     """
-    texts = np.array(cells)
+    texts = text_array(cells)
     try:
         return texts.astype(np.float64)
     except ValueError:

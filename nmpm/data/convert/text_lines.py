@@ -10,6 +10,7 @@ import re
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,15 @@ from typing import Any
 import numpy as np
 
 from nmpm._support.bounded_files import EXPANSION, check_regular, expansion_limit
+from nmpm._support.messages import one_line
 from nmpm.data.convert.base import readable
 from nmpm.errors import DataError
 
 _LINE_BYTES = 2**20
 _BUFFER_BYTES = 2**16
+_BLOCK_LINES, _ROW_BYTES = 2**11, 2**15  # lines of particles
+_TEXT_MEMORY, _TEXT_MEMORY_PER_CHARACTER = 2**20, 16
+_PARTICLE_BYTES = 4  # "0 0" and its end
 
 
 class Lines:
@@ -59,17 +64,26 @@ class Lines:
         self._count(len(lines), len(data))
         return lines
 
-    def block(self, count: int, start: int) -> list[bytes]:
+    def block(self, count: int, start: int) -> bytes:
         """The next lines, which belong to a frame that began after `start` lines.
 
         Raises:
-            ValueError: if there are fewer, or the last one is cut short.
+            ValueError: if there are fewer, one is empty, or the last one is cut short.
         """
-        lines = list(islice(self._file, count))
-        self._count(len(lines), sum(map(len, lines)))
-        if len(lines) < count or (lines and not lines[-1].endswith(b"\n")):
+        left, parts = count, list[bytes]()
+        rows = iter(partial(self._file.readline, _ROW_BYTES), b"")
+        while left and (lines := list(islice(rows, min(left, _BLOCK_LINES)))):
+            sizes = list(map(len, lines))
+            self._count(len(lines), sum(sizes))
+            if max(sizes) == _ROW_BYTES:
+                raise ValueError(f"line {self.number} or before: it has more than {_ROW_BYTES:,} characters")
+            if min(sizes) < _PARTICLE_BYTES and lines[-1].endswith(b"\n"):
+                raise ValueError(f"line {self.number} or before: an empty line among those of particles")
+            parts.append(b"".join(lines))  # lines of their own take ten times their bytes
+            left -= len(lines)
+        if left or (parts and not parts[-1].endswith(b"\n")):
             raise ValueError(f"it ends at line {self.number}, within a frame{complete_frames(start)}")
-        return lines
+        return b"".join(parts)
 
     @property
     def stored(self) -> int:
@@ -139,31 +153,44 @@ def _is_gzip(path: Path) -> bool:
         return file.read(2) == b"\x1f\x8b"
 
 
-def parse_columns(lines: Sequence[bytes], names: Sequence[str]) -> dict[str, np.ndarray]:
+def parse_columns(block: bytes, names: Sequence[str]) -> dict[str, np.ndarray]:
     """The columns of lines by name: numbers (float64), or texts where the first line has one.
 
     Raises:
         ValueError: if a line has fewer columns, or a text among numbers.
     """
-    first = lines[0].split() if lines else []
-    if lines and len(first) != len(names):
-        raise ValueError(f"{len(first)} columns, but {len(names)} names: {' '.join(names)}")
+    first = first_line(block).split()
+    if block and len(first) != len(names):
+        raise ValueError(f"{len(first)} columns, but {len(names)} names: {one_line(' '.join(names))}")
     texts = [index for index, word in enumerate(first) if not is_number(word)]
     numbers = [index for index in range(len(names)) if index not in texts]
-    if not lines:
+    if not block:
         return {name: np.zeros(0) for name in names}
     if any(re.fullmatch(rb"[-+]?\d*,\d+([eE][-+]?\d+)?", first[index]) for index in texts):
         raise ValueError("its numbers have decimal commas; write points")
-    values = np.loadtxt(lines, comments=None, usecols=numbers, ndmin=2)
-    if len(values) != len(lines):
+    values = np.loadtxt(io.BytesIO(block), comments=None, usecols=numbers, ndmin=2)
+    if len(values) != block.count(b"\n"):
         raise ValueError("an empty line among those of particles")
     columns = {names[index]: values[:, column] for column, index in enumerate(numbers)}
     for index in texts:
-        words = [line.split(None, index + 1)[index : index + 1] for line in lines]
+        words = [line.split(None, index + 1)[index : index + 1] for line in io.BytesIO(block)]
         if not all(words):
             raise ValueError(f"a line has no column {names[index]}")
-        columns[names[index]] = np.array([word for (word,) in words]).astype(str)
+        columns[names[index]] = text_array([word.decode("ascii") for (word,) in words])
     return columns
+
+
+def first_line(block: bytes) -> bytes:
+    """The first of some lines."""
+    return block[: block.find(b"\n")]
+
+
+def text_array(words: Sequence[str]) -> np.ndarray:
+    """An array of texts; raises ValueError for a long one among short ones, which would all take as much memory."""
+    longest = max(map(len, words), default=0)
+    if longest * len(words) > _TEXT_MEMORY + _TEXT_MEMORY_PER_CHARACTER * sum(map(len, words)):
+        raise ValueError(f"it has a word of {longest:,} characters")
+    return np.array(words, dtype=str)
 
 
 def is_number(word: str | bytes) -> bool:

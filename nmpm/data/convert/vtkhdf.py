@@ -44,7 +44,7 @@ class VtkHdf(FrameFormat):
     def count(self, file: Path) -> int:
         with open_hdf5(file) as content:
             root = _root(content, file)
-            return int(root["Steps"].attrs["NSteps"]) if "Steps" in root else 1
+            return sum(1 for _ in _steps(root))
 
 
 def _root(content: Any, file: Path) -> Any:
@@ -61,8 +61,14 @@ def _root(content: Any, file: Path) -> Any:
     kind = kind.decode() if isinstance(kind, bytes) else str(kind)
     if kind not in _TYPES:
         raise DataError(f"{file}: it has a {one_line(kind, 40)}; particles are points, as {' or '.join(_TYPES)}.")
+    for name in ("", "PointData", "Steps", "Steps/PointDataOffsets"):
+        for key, values in root[name or "/" + VTKHDF].items() if name in root or not name else ():
+            if isinstance(values, h5py.Dataset):
+                check_stored_size(values, f"{file}: {name}/{key}".replace(" /", " "))
     for name, values in (("Points", root["Points"]), *root.get("PointData", {}).items()):
-        check_stored_size(values, f"{file}: {name}")
+        fits = values.shape[1:] == (3,) if name == "Points" else values.ndim in (1, 2)
+        if not fits or values.dtype.kind not in "biufSO":
+            raise DataError(f"{file}: {one_line(name, 40)} is {values.dtype} {values.shape}; expected a row per point.")
     return root
 
 
@@ -73,6 +79,8 @@ def _steps(root: Any) -> Iterator[tuple[int, int, dict[str, int], float | None]]
         yield int(points.sum()), 0, {}, _time(root)
         return
     steps, number = root["Steps"], int(root["Steps"].attrs["NSteps"])
+    if not 0 <= number <= min(len(steps["Values"]), len(steps["PartOffsets"])):
+        raise DataError(f"{root.file.filename}: it has not as many steps as NSteps = {number:,}. Is it complete?")
     starts = {name: values[()] for name, values in steps.get("PointDataOffsets", {}).items()}
     firsts, times, parts = (steps[name][:number] for name in ("PointOffsets", "Values", "PartOffsets"))
     counts = steps["NumberOfParts"][:number] if "NumberOfParts" in steps else np.ones(number, int)

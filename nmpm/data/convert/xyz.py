@@ -18,10 +18,11 @@ from nmpm._support.messages import one_line
 from nmpm.data.convert.frame import Frame, wrap
 from nmpm.data.convert.frame_files import FrameFormat
 from nmpm.data.convert.named_arrays import AXES
-from nmpm.data.convert.text_lines import Lines, open_lines, parse_columns
+from nmpm.data.convert.text_lines import Lines, first_line, open_lines, parse_columns
 from nmpm.errors import DataError
 from nmpm.scene import Boundary, Interval
 
+_MOST_COLUMNS = 10_000
 _KEY = re.compile(r"(\w+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)'|(\S+))")
 
 
@@ -42,7 +43,7 @@ class Xyz(FrameFormat):
             return sum(1 for _ in _blocks(lines))
 
 
-def _blocks(lines: Lines) -> Iterator[tuple[str, list[bytes]]]:
+def _blocks(lines: Lines) -> Iterator[tuple[str, bytes]]:
     """Yields the comment and the lines of particles of each frame."""
     while line := lines.next():
         start = lines.number - 1
@@ -53,10 +54,11 @@ def _blocks(lines: Lines) -> Iterator[tuple[str, list[bytes]]]:
         yield lines.next(), lines.block(int(line), start)
 
 
-def _frame(comment: str, block: Sequence[bytes], where: str) -> Frame:
+def _frame(comment: str, block: bytes, where: str) -> Frame:
     keys = {match[1].lower(): match[2] or match[3] or match[4] or "" for match in _KEY.finditer(comment)}
     try:
-        names = _columns(keys["properties"]) if "properties" in keys else _plain_columns(block)
+        width = len(first_line(block).split())
+        names = _columns(keys["properties"], width) if "properties" in keys else _plain_columns(width or 4)
         columns = parse_columns(block, [f"{name}/{part}" for name, width in names for part in range(width)])
         arrays = {name: _join([columns[f"{name}/{part}"] for part in range(width)]) for name, width in names}
         position = arrays.pop("pos")
@@ -70,17 +72,19 @@ def _frame(comment: str, block: Sequence[bytes], where: str) -> Frame:
         raise DataError(f"{where}: {one_line(error)}.") from error
 
 
-def _columns(properties: str) -> list[tuple[str, int]]:
-    """Names and widths of the columns that `Properties` lists."""
+def _columns(properties: str, present: int) -> list[tuple[str, int]]:
+    """Names and widths of the columns that `Properties` lists; as many as are present, where there are particles."""
     words = properties.split(":")
-    if len(words) % 3 or not all(width.isdecimal() and int(width) for width in words[2::3]) or "pos" not in words[::3]:
+    if len(words) % 3 or not all(width.isdecimal() for width in words[2::3]) or "pos" not in words[::3]:
         raise ValueError(f"Properties={one_line(properties, 60)} does not list names, kinds and widths, or has no pos")
-    return [(name, int(width)) for name, width in zip(words[::3], words[2::3], strict=True)]
+    widths = [int(width[:10]) for width in words[2::3]]
+    if 0 in widths or (sum(widths) != present and present) or sum(widths) > _MOST_COLUMNS:
+        raise ValueError(f"Properties={one_line(properties, 60)} lists {sum(widths):,} columns, not {present}")
+    return list(zip(words[::3], widths, strict=True))
 
 
-def _plain_columns(block: Sequence[bytes]) -> list[tuple[str, int]]:
+def _plain_columns(width: int) -> list[tuple[str, int]]:
     """Names and widths of the columns of plain XYZ."""
-    width = len(block[0].split()) if block else 4
     rest = [("velocity", 3)] if width == 7 else [(f"column{index}", 1) for index in range(5, width + 1)]
     return [("type", 1), ("pos", max(1, min(width - 1, 3))), *rest]
 

@@ -1,9 +1,11 @@
+import re
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from nmpm._support.messages import install
 from nmpm.data.convert import Options, convert
 from nmpm.data.format import Split, read_metadata
 from nmpm.errors import ConfigError, DataError
@@ -61,7 +63,7 @@ def test_a_changing_number_of_particles_is_refused(tmp_path):
 def test_missing_packages_give_the_install_command(tmp_path, monkeypatch):
     path = write(tmp_path / "a.msgpack.zst", frames())
     monkeypatch.setitem(sys.modules, "zstandard", None)
-    with pytest.raises(ConfigError, match=r'pip install "nmpm\[convert\]"'):
+    with pytest.raises(ConfigError, match=re.escape(install("convert"))):
         convert(path, tmp_path / "out")
 
 

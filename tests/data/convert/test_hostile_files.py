@@ -1,8 +1,10 @@
 """The promises of SECURITY.md: declared sizes are checked before memory is taken; errors are typed and of one line."""
 
+import gzip
 import json
 import os
 import pickle
+import resource
 import struct
 import zipfile
 
@@ -139,3 +141,127 @@ def test_metadata_beyond_all_bounds(tmp_path, change):
     with pytest.raises(DataError, match=r"metadata\.json") as caught:
         read_metadata(tmp_path)
     assert len(str(caught.value).replace(str(tmp_path), "")) < 300
+
+
+def frames_of(folder, name, content):
+    """A folder of three files with this content."""
+    folder.mkdir(exist_ok=True)
+    for frame in range(3):
+        (folder / name.replace("*", str(frame))).write_bytes(content)
+    return folder
+
+
+def refused(source, out):
+    """The error of a conversion, which takes at most 200 MB."""
+    before = peak_memory()
+    with pytest.raises(DataError) as error:
+        convert(source, out)
+    assert peak_memory() - before < 200e6
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def peak_memory():
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+ROWS = b"a 0 0 0\n" * 2000
+HEADER = b"ply\nformat %s 1.0\nelement vertex %d\nproperty float x\nproperty float y\nproperty int id\nend_header\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("f_*.xyz", b"1\nProperties=pos:R:1000000000\n0 0 0\n"),
+        ("f_*.xyz", b"1\nProperties=species:S:1:pos:R:3:more:R:" + b"9" * 4000 + b"\na 0 0 0\n"),
+        ("f_*.xyz", b"900000000000\n\n" + ROWS),
+        ("f_*.xyz", b"9" * 5000 + b"\n\n" + ROWS),
+        ("f_*.xyz", b"2001\n\n" + ROWS + b"b" * 10**6 + b" 0 0 0\n"),
+        ("f_*.xyz.gz", gzip.compress(b"90000000\n\n" + b"\n" * 10**8)),
+        ("f_*.xyz.gz", gzip.compress(b"90000000\n\n" + bytes(4 * 10**8))),
+        ("f_*.csv", b"x,y,name\n" + b"0,1,a\n" * 9000 + b"0,1," + b"b" * 10**6 + b"\n"),
+        ("f_*.ply", HEADER % (b"ascii", 4 * 10**9) + b"0 0 0\n"),
+        ("f_*.ply", HEADER % (b"binary_little_endian", 4 * 10**9) + bytes(12)),
+        ("f_*.ply", HEADER % (b"ascii", 1) + b"0 0 4294967295\n"),
+    ],
+    ids=["columns", "width", "count", "digits", "word", "lines", "zeros", "cell", "ply", "binary ply", "integer"],
+)
+def test_text_that_declares_much(tmp_path, name, content):
+    assert name.partition("*")[2] in refused(frames_of(tmp_path / "run", name, content), tmp_path / "out")
+
+
+def write_vtkhdf(path, change):
+    with h5py.File(path, "w") as file:
+        root = file.create_group("VTKHDF")
+        root.attrs["Type"], root.attrs["Version"] = np.bytes_("PolyData"), [2, 2]
+        root["NumberOfPoints"], root["Points"] = np.full(4, 5), np.random.default_rng(0).random((20, 3))
+        root["PointData/id"] = np.tile(np.arange(5), 4)
+        steps = root.create_group("Steps")
+        steps.attrs["NSteps"], steps["Values"], steps["PartOffsets"] = 4, np.arange(4.0), np.arange(4)
+        steps["PointOffsets"], steps["PointDataOffsets/id"] = 5 * np.arange(4), 5 * np.arange(4)
+        change(root)
+    return path
+
+
+def declare(name, shape):
+    def change(root):
+        del root[name]
+        root.create_dataset(name, shape, "i8", chunks=(min(shape[0], 1000), *shape[1:]))
+
+    return change
+
+
+def state_steps(number, *names):
+    def change(root):
+        root["Steps"].attrs["NSteps"] = number
+        for name in names:
+            declare(f"Steps/{name}", (number,))(root)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        state_steps(8 * 10**8, "Values", "PartOffsets", "PointOffsets"),
+        state_steps(8 * 10**8),
+        state_steps(-1),
+        declare("NumberOfPoints", (10**9,)),
+        declare("Steps/PointDataOffsets/id", (10**9,)),
+        declare("Points", (20,)),
+        declare("PointData/id", (20, 2, 2, 2)),
+    ],
+    ids=["steps", "steps stated", "negative", "points", "offsets", "shape", "axes"],
+)
+def test_vtkhdf_that_declares_much(tmp_path, change):
+    assert "a.vtkhdf" in refused(write_vtkhdf(tmp_path / "a.vtkhdf", change), tmp_path / "out")
+
+
+def test_npz_headers_that_are_no_python(tmp_path):
+    text = b"{'descr': ',i8', 'fortran_order': False, 'shape': (12,), }".ljust(117) + b"\n"
+    np.savez(tmp_path / "a.npz", positions=np.zeros((3, 12, 2), "f4"))
+    with zipfile.ZipFile(tmp_path / "a.npz", "a") as archive:
+        archive.writestr("types.npy", b"\x93NUMPY\x01\x00v\x00" + text + bytes(96))
+    assert "types" in refused(tmp_path / "a.npz", tmp_path / "out")
+
+
+HOSTILE = (
+    "180_untyped_a.npz", "bomb36.xyz", "nsteps_8e8.vtkhdf", "pointdata_5d.vtkhdf", "points_2d.vtkhdf", "ppoly/data",
+    "quotes", "vtkcrash", "ply_overflow.ply",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_recorded_hostile_files(recorded, tmp_path, name):
+    source = recorded / "hostile" / name
+    if source.suffix in (".vtk", ".ply"):
+        pytest.importorskip("vtkmodules", reason="the extra `vtk` is not installed")
+        source = frames_of(tmp_path / "run", f"f_*{source.suffix}", source.read_bytes())
+    refused(source, tmp_path / "out")
+
+
+def test_names_in_other_encodings_are_read(recorded, tmp_path):
+    pytest.importorskip("vtkmodules", reason="the extra `vtk` is not installed")
+    content = (recorded / "hostile" / "legacy_bytes_name.vtk").read_bytes()
+    convert(frames_of(tmp_path / "run", "f_*.vtk", content), tmp_path / "out")
+    assert Split(tmp_path / "out" / "train.h5").read(0).position.shape == (3, 12, 2)

@@ -158,7 +158,10 @@ GOOD = frame_text(0, [(1, 0.1, 0.2), (2, 0.3, 0.4)], "id x y")
         (GOOD.replace("0.3", "nan").replace("\n0\n", "\n7\n"), r"frame 1: position of particle 1 is \[nan, 0.4\]"),
         (GOOD.replace("id x y", "id q r").replace("\n0\n", "\n7\n"), "timestep 7: no columns x y, .*found: id q r"),
         (GOOD.replace("0.1", "abc").replace("\n0\n", "\n7\n"), "timestep 7: the columns x y must contain numbers"),
-        (GOOD.replace("1 0.1 0.2", "a 0.1 0.2").replace("2 0.3 0.4", "").replace("\n0\n", "\n7\n"), "timestep 7: "),
+        (
+            GOOD.replace("1 0.1 0.2", "a 0.1 0.2").replace("2 0.3 0.4", "").replace("\n0\n", "\n7\n"),
+            "line 22 or before: an empty",
+        ),
         (GOOD.replace("ff ff pp", "ff pp"), "line 16 has 2 boundaries, not one for each of three axes"),
         ("something else\n", "line 12 is 'something else'; expected ITEM: TIMESTEP"),
     ],
