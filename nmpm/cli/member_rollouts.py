@@ -16,7 +16,7 @@ from rich.console import Console
 from torch import Tensor
 
 from nmpm.cli.prediction import milliseconds, on_device, predicted, timed_parts
-from nmpm.cli.recorded_start import compared, recorded_errors
+from nmpm.cli.recorded_start import RecordedStart, compared, recorded_errors
 from nmpm.data.described import described_metadata
 from nmpm.data.format import MEMBER, Trajectory
 from nmpm.data.write import find_writer, write_trajectories
@@ -44,6 +44,7 @@ class MemberRollouts:
         between: Frames of the model per written frame.
         prescribed: What moves or enters as recorded.
         window: What was recorded, at the frames that are written; None of thrown blocks.
+        recorded: The trajectory that the members start from; None of thrown blocks.
     """
 
     model: Pretrained
@@ -55,6 +56,7 @@ class MemberRollouts:
     between: int = 1
     prescribed: Prescribed | None = None
     window: Window | None = None
+    recorded: RecordedStart | None = None
 
     def run(self, single: Rollout | None = None) -> str:
         """Predict and write; print the errors beside those of a `single` rollout; return how to look at the files."""
@@ -93,6 +95,7 @@ class MemberRollouts:
             start = self.written.with_motion(starts.position[[member]], self.written.velocity)
             rollout = frames.member(member)
             made = predicted(self.model, self.options.model, self.scene, start, rollout, self.window)
+            made = made if self.recorded is None else self.recorded.as_recorded(made)
             return replace(made, attributes=made.attributes | {MEMBER: member})
 
         first = trajectory(0)

@@ -13,7 +13,7 @@ from nmpm._support.devices import device_name
 from nmpm._support.progress import progress_bar
 from nmpm.data.described import described_metadata
 from nmpm.data.format import TRUTH, Trajectory
-from nmpm.data.predictions import BOUNDARY, MOVING_WALL, predicted_trajectory
+from nmpm.data.predictions import predicted_trajectory
 from nmpm.data.write import find_writer, write_trajectory
 from nmpm.emulator import Prescribed, Rollout, stream_rollout
 from nmpm.emulator.input_checks import warn_of_start_outside
@@ -133,8 +133,9 @@ def predicted(
 
 def write_prediction(out: Path, trajectory: Trajectory) -> str:
     """Write a prediction and print what is in the file; return how to look at it."""
-    file = write_trajectory(out, trajectory, described_metadata(trajectory.attributes, out, len(trajectory.position)))
-    particles = int((~np.isin(trajectory.particle_type, (BOUNDARY, MOVING_WALL))).sum())
+    metadata = described_metadata(trajectory.attributes, out, len(trajectory.position))
+    file = write_trajectory(out, trajectory, metadata)
+    particles = int(metadata.is_moving(trajectory.particle_type).sum())
     beside = ", beside the recording" if TRUTH in trajectory.fields else ""
     frames = f"2 frames of the start and {len(trajectory.position) - 2} predicted"
     sys.stdout.write(f"wrote {frames}, of {particles} particles{beside}, to {file}\n")

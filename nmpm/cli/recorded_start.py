@@ -16,7 +16,7 @@ from nmpm.data.convert import native_file
 from nmpm.data.convert.native import file_metadata, with_family
 from nmpm.data.dataset import Dataset
 from nmpm.data.facts import FOUND
-from nmpm.data.format import METADATA_FILE, Metadata, Split
+from nmpm.data.format import METADATA_FILE, Metadata, Split, Trajectory
 from nmpm.data.gravity import check_gravity, trajectory_gravity
 from nmpm.data.loading.padded_batch import collate
 from nmpm.data.loading.recording import SplitRecordings
@@ -44,6 +44,8 @@ class RecordedStart:
         written: The trajectory at the frames that are written: those of the data, or every k-th of them where the
             model's frames are so much longer; in the data's materials.
         scene: Of `written`.
+        recordings: Of the trajectory's split.
+        index: Of the trajectory.
         between: Frames of the model per written frame.
     """
 
@@ -51,7 +53,13 @@ class RecordedStart:
     window: Window
     written: Window
     scene: Scene
+    recordings: SplitRecordings
+    index: int
     between: int = 1
+
+    def as_recorded(self, predicted: Trajectory) -> Trajectory:
+        """A prediction with the ids and types that its particles have in the data."""
+        return self.recordings.as_recorded(predicted, self.index)
 
     @classmethod
     def of(cls, model: Pretrained, options: argparse.Namespace) -> RecordedStart:
@@ -78,8 +86,9 @@ class RecordedStart:
         if stated.stride is None and is_of_kind(model.scene, metadata, split, index):
             warn_of_ignored(model.scene, metadata.fields)
             plain = Reading(model.scene)
-            window = collate([SplitRecordings(split, metadata, plain)[index]], plain)
-            return cls(model, window, window, model.scene)
+            recordings = SplitRecordings(split, metadata, plain)
+            window = collate([recordings[index]], plain)
+            return cls(model, window, window, model.scene, recordings, index)
         beside = path == split.path and (path.parent / METADATA_FILE).is_file()
         data = Dataset(FolderSource(path.parent if beside else path, facts))
         match = match_data(model, data, *stated)
@@ -89,7 +98,8 @@ class RecordedStart:
             collate([SplitRecordings(split, metadata, reading)[index]], reading)
             for reading in (match.reading, Reading(scene, every=match.reading.every))
         )
-        return cls(model.matched(match), window, written, scene, match.reading.between)
+        recordings = SplitRecordings(split, metadata, match.reading)
+        return cls(model.matched(match), window, written, scene, recordings, index, match.reading.between)
 
 
 def is_of_kind(scene: Scene, metadata: Metadata, split: Split, index: int) -> bool:

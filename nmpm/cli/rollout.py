@@ -105,13 +105,13 @@ def _from_recording(model: Pretrained, options: argparse.Namespace) -> str:
     state = start.window.initial
     if options.members is not None:
         members = MemberRollouts(
-            model, start.scene, state, written.initial, frames, options, start.between, prescribed, window
+            model, start.scene, state, written.initial, frames, options, start.between, prescribed, window, start
         )
         single = _predict(model, state, frames, options, prescribed, start.between) if recorded else None
         return members.run(single)
     rollout = _predict(model, state, frames, options, prescribed, start.between)
     trajectory = predicted(model, options.model, start.scene, written.initial, rollout, window)
-    hint = write_prediction(options.out, trajectory)
+    hint = write_prediction(options.out, start.as_recorded(trajectory))
     if recorded:
         bundle, what = max(1, model.emulator.frames // start.between), compared(written, rollout, options)
         Console().print(error_table(what, recorded_errors(start.scene, bundle, written, [rollout])))

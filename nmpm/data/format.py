@@ -3,7 +3,8 @@
 A dataset is a folder with `metadata.json` and `train.h5`, `valid.h5`, `test.h5`. In each file there is a group per
 trajectory, named `00000`, `00001`, …, with the datasets `position` (T, N, D), float32, and `particle_type` (N,),
 integer, and optional attributes such as `gravity` (D,) in length/s² and `seed`. All other datasets of a group, such as
-`temperature` (T, N), are fields and kept unchanged.
+`temperature` (T, N), are fields and kept unchanged. Two of them identify particles: `id` (N,), the number or text that
+the data call a particle by, and `track` (T, N), the same where a column holds several particles one after the other.
 
 A particle that is not there in a frame has NaN in all coordinates of its position there.
 """
@@ -41,6 +42,8 @@ MEMBER = "member"
 """Attribute of a trajectory that is a member of an ensemble: its number, from 0; neighbours count up."""
 VTKHDF = "VTKHDF"
 """Group by which ParaView reads a file, see `nmpm.data.write.vtkhdf`; it is not a trajectory."""
+ID = "id"
+"""Dataset of the numbers or texts (N,) that the particles have in the data; (T, N) texts beside `track`."""
 TRACK = "track"
 """Dataset of numbers (T, N) that tell particles apart that share a column, one after the other with gaps between; -1
 where there is none."""
@@ -77,6 +80,19 @@ class Trajectory:
         check_positions(self.position, "trajectory", first_frame=0)
         for name, values in self.fields.items():
             check_field(name, values)
+
+    def ids(self, kinds: str = "iu", first: int = 0) -> np.ndarray:
+        """(T, N) numbers, or texts, by which the data call the particles; those of columns where they do not.
+
+        Args:
+            kinds: NumPy's kinds of ids that will do.
+            first: Number of the first column.
+        """
+        sizes = self.position.shape[:2]
+        stored: list[Any] = [np.asarray(self.fields[name]) for name in (ID, TRACK) if name in self.fields]
+        fitting = [ids for ids in stored if ids.shape in (sizes, sizes[1:]) and ids.dtype.kind in kinds]
+        ids: Any = fitting[0] if fitting else first + np.arange(sizes[1])
+        return np.broadcast_to(np.char.decode(ids, "utf-8") if ids.dtype.kind == "S" else ids, sizes)
 
 
 def write_split(path: Path, trajectories: Iterable[Trajectory]) -> None:
@@ -190,6 +206,17 @@ class Split:
     def tracks(self, index: int) -> np.ndarray | None:
         """The (T, N) numbers of the particles in each column, its field `track`; None where each holds one alone."""
         return self._numbers(index, TRACK, (self._entries[index].frames, self.particles(index)), "iu")
+
+    def ids(self, index: int) -> np.ndarray:
+        """The (N,) or (T, N) numbers or texts by which the data call particles; those of columns where they do not."""
+        sizes = (self._entries[index].frames, self.particles(index))
+        with open_hdf5(self.path) as file:
+            for name in (ID, TRACK):
+                stored = file[self._entries[index].name].get(name)
+                if isinstance(stored, h5py.Dataset) and stored.shape in (sizes, sizes[1:]):
+                    check_stored_size(stored, f"{self.where(index)}: {name}")
+                    return self.cut(index, np.asarray(stored[()]))
+        return np.arange(sizes[1])
 
     def _numbers(self, index: int, name: str, shape: tuple[int, ...], kinds: str) -> np.ndarray | None:
         """The frames of a field, or None if the trajectory has none of that name, shape and kinds of numbers."""

@@ -27,8 +27,7 @@ def labelled_trajectories(scene: Scene, window: Window, predicted: Tensor, title
     prediction = torch.cat([truth[:2], predicted[0][:, real]])
     broken = ~prediction.isfinite().flatten(1).all(1)
     if window.present is not None:  # (NaN where a particle is absent)
-        lost = prediction.isnan().flatten(1).all(1) & window.present[0, : len(prediction), real].any(1)
-        broken = prediction.isinf().flatten(1).any(1) | lost
+        broken = prediction.isinf().flatten(1).any(1) | prediction.isnan().flatten(1).all(1)
     frames = int(broken.int().argmax()) if broken.any() else len(prediction)
     rows = {"truth": truth[:frames].numpy(), "prediction": prediction[:frames].numpy()}
     obstacle = window.obstacle[0, window.obstacle_mask[0]].numpy()

@@ -59,7 +59,7 @@ def test_fields_that_a_form_cannot_hold_are_named(dataset, capsys):
     run = Split(dataset / "test.h5").read(0)
     write_split(dataset / "test.h5", [Trajectory(run.position, run.particle_type, {}, {"noise": np.zeros(99)})])
     assert main(["convert", str(dataset), "out.csv", "--split", "test"]) == 0
-    assert "- Not of particles, so left out: noise" in capsys.readouterr().out
+    assert "- Not numbers of particles, so left out: noise" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".vtkhdf", ".npz", ".csv", ".pvd", ".lammpstrj"])

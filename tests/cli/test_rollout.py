@@ -9,6 +9,7 @@ from nmpm import Zoo, load_trajectories
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.data import catalog
+from nmpm.data.convert import open_dataset
 from nmpm.data.format import Split, read_metadata
 from nmpm.data.generate import generate
 from nmpm.emulator.trust import Trust
@@ -194,3 +195,34 @@ def test_a_rollout_ends_with_the_last_trusted_frame_or_goes_on_with_the_simulato
     ):
         assert main(words) == 1
         assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("members", [[], ["--members", "2"]])
+def test_a_rollout_keeps_the_ids_and_types_of_its_recording(folder, members):
+    """Those of a table whose rows are in any order, with particles that come late, in every form that has ids."""
+    run = Split(make_goop(folder / "made") / "test.h5").read(0)
+    rng, count = np.random.default_rng(0), run.position.shape[1]
+    ids, types = 7 + rng.permutation(3 * count)[:count], rng.integers(4, 6, count)
+    late = rng.random(count) < 0.1
+    rows = [
+        f"{frame},{ids[i]},{'slime' if types[i] == 5 else 'goop'},{x!r},{y!r}"
+        for frame, positions in enumerate(run.position.tolist())
+        for i, (x, y) in enumerate(positions)
+        if frame > 1 or not late[i]
+    ]
+    (folder / "mine.csv").write_text("\n".join(["frame,id,type,x,y", *rng.permutation(rows).tolist()]) + "\n")
+    facts = ["--bounds", "0.1:0.9,0.1:0.9", "--gravity", "0,-9.81", "--materials", "slime=goop", "--frames", "2"]
+    for suffix in (".h5", ".csv") if members else (".h5", ".npz", ".csv", ".lammpstrj", ".vtkhdf"):
+        words = ["rollout", "goop", "--data", "mine.csv", *facts, *members, "--out", f"out{suffix}"]
+        assert main(words) == 0
+        name = f"out-0{suffix}" if members and suffix == ".csv" else f"out{suffix}"
+        predicted = open_dataset(folder / name)
+        written = next(next(iter(predicted.splits.values()))())
+        here = np.flatnonzero(~np.isnan(written.position[0, :, 0]))
+        column = {number: index for index, number in enumerate(ids.tolist())}
+        source = np.array([column[number] for number in written.ids()[0, here].tolist()])
+        assert not late[source].any()
+        np.testing.assert_allclose(written.position[0, here], run.position[0, source], atol=0.02 if members else 1e-6)
+        names = predicted.metadata.particle_types
+        if suffix in (".h5", ".npz", ".vtkhdf"):  # the others have numbers
+            assert [names[n] for n in written.particle_type[here]] == [("goop", "slime")[t - 4] for t in types[source]]

@@ -14,7 +14,7 @@ from nmpm._support.progress import progress_bar
 from nmpm.data.convert import native_folder, open_dataset
 from nmpm.data.convert.base import ForeignDataset, Options
 from nmpm.data.convert.conversion import NOTES, write_native
-from nmpm.data.format import Trajectory
+from nmpm.data.format import ID, Trajectory
 from nmpm.data.write import TrajectoryWriter, find_writer, write_trajectory
 from nmpm.data.write.frames import fields_left_out
 from nmpm.errors import ConfigError, DataError
@@ -70,8 +70,9 @@ def export(dataset: ForeignDataset, destination: Path, split: str | None, index:
     if index >= counts[name]:
         raise ConfigError(f"--trajectory {index}: the {name} split has trajectories 0 … {counts[name] - 1}.")
     trajectory = next(islice(dataset.splits[name](), index, None))
-    left_out = set() if writer.holds_all_fields else set(fields_left_out(trajectory))
-    return Exported(write_trajectory(destination, trajectory, dataset.metadata), 1, _notes(left_out))
+    return Exported(
+        write_trajectory(destination, trajectory, dataset.metadata), 1, _notes(_left_out(writer, trajectory))
+    )
 
 
 def _export_all(
@@ -87,7 +88,7 @@ def _export_all(
         for path, trajectory in _files(dataset, new, destination.suffix, counts):
             path.parent.mkdir(exist_ok=True)
             writer.write(path, trajectory, dataset.metadata)
-            left_out |= set() if writer.holds_all_fields else set(fields_left_out(trajectory))
+            left_out |= _left_out(writer, trajectory)
             step()
     return Exported(folder, sum(counts.values()), _notes(left_out))
 
@@ -100,7 +101,14 @@ def _files(
             yield folder / name / f"{index:05d}{suffix}", trajectory
 
 
+def _left_out(writer: TrajectoryWriter, trajectory: Trajectory) -> set[str]:
+    """Fields that a form does not hold."""
+    if writer.holds_all_fields:
+        return set()
+    return set(fields_left_out(trajectory)) - ({ID} if writer.holds_text_ids else set())
+
+
 def _notes(left_out: set[str]) -> tuple[str, ...]:
     if not left_out:
         return ()
-    return (f"Not of particles, so left out: {', '.join(sorted(left_out))}; .npz and .h5 hold all fields.",)
+    return (f"Not numbers of particles, so left out: {', '.join(sorted(left_out))}; .npz and .h5 hold all fields.",)

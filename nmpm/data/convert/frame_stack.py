@@ -11,7 +11,7 @@ from nmpm._support.memory import check_fits
 from nmpm._support.messages import one_line
 from nmpm.data.convert.frame import Frame, Layout, ParticleArrays
 from nmpm.data.convert.named_arrays import AXES, plain_name, type_ids
-from nmpm.data.format import Trajectory
+from nmpm.data.format import ID, Trajectory
 from nmpm.errors import DataError
 
 _log = logging.getLogger(__name__)
@@ -203,8 +203,8 @@ class FrameStack:
                 for row in array:  # in place: no second copy of the run
                     row[: len(order)] = row[order]
         values = {name: _constant(name, array[:, : len(order)]) for name, array in values.items()}
-        position = values.pop("position")
-        return Trajectory(position, types[order], {}, values | self._time())
+        position, ids = values.pop("position"), {ID: self._ids[order]} if self._has_ids else {}
+        return Trajectory(position, types[order], {}, values | ids | self._time())
 
     def _time(self) -> dict[str, np.ndarray]:
         """The field `time` (T,), or steps' numbers, where two or more frames state it; the others are interpolated."""

@@ -254,6 +254,7 @@ def find_roles(arrays: Arrays, position: str) -> dict[str, str]:
         "types": [(), *at_particles, (frames,), (frames, 1)],  # (frames,) where the axes of positions are swapped
         "velocity": [(frames, particles, dim)],
         "active": at_particles,
+        "id": at_particles,
         "time": [(frames,), (frames, 1)],
         "dt": [(), (1,)],
         "gravity": [(dim,), (3,)],
@@ -279,7 +280,7 @@ def find_roles(arrays: Arrays, position: str) -> dict[str, str]:
 
 _LISTS = {"type_names": "SUO", "static_types": "iu", "boundary": "SUO"}
 """Kinds of the numbers or texts of facts that are lists of any length."""
-_TEXTS = ("types", "active", "time")
+_TEXTS = ("types", "active", "time", "id")
 """Meanings of arrays that may be of texts, or of dates."""
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, get_args
 
@@ -27,13 +27,15 @@ from nmpm.data.convert.named_arrays import (
     find_roles,
     in_plane,
     join_components,
+    plain_name,
     plane_notes,
     position_name,
     type_ids,
     usual_position,
 )
 from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Facts, cut, placeholder_metadata
-from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.convert.track_rows import TrackRows
+from nmpm.data.format import ID, TRACK, Metadata, Trajectory
 from nmpm.errors import DataError
 from nmpm.scene import Boundary, Interval
 
@@ -110,7 +112,7 @@ class RunArrays:
         if name is None:
             return None
         values = self._take(name, run)
-        return self._without_last(values) if meaning in ("types", "active", "time") else values
+        return self._without_last(values) if meaning in ("types", "active", "time", "id") else values
 
     def _without_last(self, values: np.ndarray) -> np.ndarray:
         """(T, N, 1), (N, 1) and (T, 1) values of particles or frames without their last axis."""
@@ -175,13 +177,35 @@ class RunArrays:
         types = self._types(run, position.shape[:2], metadata, where)
         check_axes(position, None if types is None else types.shape[-1], where)
         position = in_plane(position, metadata.dim, constant, where)
-        fixed = np.zeros(position.shape[1], np.int64) if types is None else _constant_types(types, where)
+        types = np.zeros(position.shape[1], np.int64) if types is None else types
         gravity, attributes = self._fact("gravity", run), {}
         if gravity is not None and gravity.ndim == 1 and len(gravity) >= metadata.dim:
             attributes = {"gravity": drop_axis(gravity, constant)[: metadata.dim].astype(np.float64)}
+        fields = self._fields(run, constant, where)
+        ids = self._ids(run, fields, position)
         with located(where):
-            trajectory = Trajectory(position, fixed, attributes, self._fields(run, constant, where))
+            if ids.ndim == 2:
+                return replace(_by_ids(ids, position, types, fields, where), attributes=attributes)
+            fields |= {ID: ids} if len(ids) else {}
+            trajectory = Trajectory(position, _constant_types(types, where), attributes, fields)
         return cut(trajectory, range(len(position)))
+
+    def _ids(self, run: int, fields: dict[str, np.ndarray], position: np.ndarray) -> np.ndarray:
+        """(N,) ids of the columns, (T, N) where columns hold other particles in other frames; (0,) if there are none.
+
+        Numbers that are no ids, and those of columns that hold particles one after the other, are left to the fields.
+        """
+        ids, none = self._fact("id", run), np.zeros(0, np.int64)
+        if ids is None:
+            return none
+        name, there = self.roles["id"], ~np.isnan(position[..., 0])
+        ids = np.char.encode(ids, "utf-8") if ids.dtype.kind == "U" else ids
+        if plain_name(name) == TRACK or not _are_ids(np.broadcast_to(ids, there.shape), there):
+            fields[name] = ids
+            return none
+        first = np.take_along_axis(np.broadcast_to(ids, there.shape), there.argmax(axis=0)[None], axis=0)[0]
+        ids = first if ((ids == first) | ~there).all() else ids
+        return ids.astype(np.int64) if ids.dtype.kind == "f" else ids
 
     def _position(self, run: int, where: str) -> np.ndarray:
         """(T, N, D) float32 positions, NaN where a mask of 0 or a type of -1 says that a particle is absent."""
@@ -223,6 +247,35 @@ class RunArrays:
         if time is not None:
             fields["time"] = as_times(time, f"{where}: {self.roles['time']}")
         return fields
+
+
+def _are_ids(ids: np.ndarray, there: np.ndarray) -> bool:
+    """Whether (T, N) values are whole numbers or texts that differ between the particles that are there in a frame."""
+    whole = ids.dtype.kind != "f" or bool((ids == np.round(ids))[there].all())
+    return whole and all(len(np.unique(row[here])) == here.sum() for row, here in zip(ids, there, strict=True))
+
+
+def _by_ids(
+    ids: np.ndarray, position: np.ndarray, types: np.ndarray, fields: Mapping[str, np.ndarray], where: str
+) -> Trajectory:
+    """The trajectory of (T, N) particles that are in any order in each frame."""
+    there = ~np.isnan(position[..., 0])
+    frame, _ = np.nonzero(there)
+    at_particles = {name: values[there] for name, values in fields.items() if values.shape[:2] == ids.shape}
+    time, velocity = fields.get("time"), at_particles.pop("velocity", None)
+    rows = TrackRows(
+        row=np.arange(len(frame)),
+        position=position[there],
+        track=ids[there],
+        key=frame.astype(np.float64),
+        time=None if time is None else time[frame],
+        types=np.broadcast_to(types, ids.shape)[there],
+        values={name: values for name, values in at_particles.items() if values.ndim == 1},
+        velocity=velocity,
+    )
+    trajectory = rows.trajectory(where)
+    others = {name: values for name, values in fields.items() if name not in {*at_particles, "time", "velocity"}}
+    return replace(trajectory, fields=others | trajectory.fields)
 
 
 def _constant_types(types: np.ndarray, where: str) -> np.ndarray:

@@ -21,7 +21,7 @@ from nmpm.data.convert.base import (
     split_files,
     split_runs,
 )
-from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.format import ID, Metadata, Trajectory
 from nmpm.data.metadata import find_family
 from nmpm.data.split_files import SPLITS
 from nmpm.errors import DataError
@@ -170,11 +170,11 @@ def cut(trajectory: Trajectory, part: range) -> Trajectory:
     if len(part) == frames and (keep.all() or not keep.any()):
         return trajectory
 
-    def cut_field(values: np.ndarray) -> np.ndarray:
-        if values.shape[:1] == (frames,):
+    def cut_field(name: str, values: np.ndarray) -> np.ndarray:
+        if values.shape[:1] == (frames,) and not (name == ID and values.shape == (particles,)):
             values = values[part.start : part.stop]
             return values[:, keep] if values.shape[1:2] == (particles,) else values
         return values[keep] if values.shape[:1] == (particles,) else values
 
-    fields = {name: cut_field(values) for name, values in trajectory.fields.items()}
+    fields = {name: cut_field(name, values) for name, values in trajectory.fields.items()}
     return Trajectory(position[:, keep], trajectory.particle_type[keep], trajectory.attributes, fields)

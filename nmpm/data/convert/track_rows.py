@@ -5,11 +5,12 @@ from __future__ import annotations
 import heapq
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from nmpm.data.convert.tables import one_cell
-from nmpm.data.format import TRACK, Trajectory
+from nmpm.data.format import ID, TRACK, Trajectory
 from nmpm.errors import DataError
 
 _JITTER = 0.1  # of the time between frames
@@ -34,14 +35,17 @@ class TrackRows:
         """The run with a particle for each track, or slots that hold one track after the other.
 
         Tracks share slots where most of a (T, tracks) array would be empty: a slot holds tracks of one type, with at
-        least one absent frame between them, and the field `track` tells them apart. Other columns become fields (T, N),
+        least one absent frame between them, and the field `track` tells them apart; else the field `id` has the track
+        of each particle. Other columns become fields (T, N),
         where a particle is absent with the value before (or after) that; (N,) if they are constant.
 
         Raises:
             DataError: if a track has two rows in a frame or changes its type; names the rows.
         """
         frame_of, frames = frame_numbers(self.key)
-        _, track = np.unique(self.track, return_inverse=True)
+        ids, track = np.unique(self.track, return_inverse=True)
+        ids = np.char.encode(ids, "utf-8") if ids.dtype.kind == "U" else ids
+        ids = ids.astype(np.int64) if ids.dtype.kind != "S" and (ids == np.round(ids)).all() else ids
         self._check_rows(track, frame_of, where)
         types = self._types_of_tracks(track, where)
         slot_of = np.arange(len(types))
@@ -50,7 +54,7 @@ class TrackRows:
             slot_of = assign_slots(track, frame_of, types)
         slot, count = slot_of[track], int(slot_of.max()) + 1
 
-        def placed(values: np.ndarray, absent: float = np.nan, dtype: type = np.float32) -> np.ndarray:
+        def placed(values: np.ndarray, absent: Any = np.nan, dtype: Any = np.float32) -> np.ndarray:
             array = np.full((frames, count, *values.shape[1:]), absent, dtype)
             array[frame_of, slot] = values
             return array
@@ -60,8 +64,12 @@ class TrackRows:
         position = placed(self.position)
         present = ~np.isnan(position[..., 0])
         fields = {name: _filled(placed(values), present) for name, values in self.values.items()}
-        if shared:
-            fields[TRACK] = placed(track, -1, np.int32)
+        if not shared:
+            fields[ID] = ids
+        elif ids.dtype.kind != "i" or ids[0] < 0:
+            fields |= {ID: placed(ids[track], ids.dtype.type(), ids.dtype), TRACK: placed(track, -1, np.int64)}
+        else:
+            fields[TRACK] = placed(ids[track], -1, np.int64)
         if self.velocity is not None:
             fields["velocity"] = placed(self.velocity)
         if self.time is not None:

@@ -9,10 +9,12 @@ between them. Materials, and the frames of which gravity is per frame squared, a
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +23,7 @@ from torch import Tensor
 from nmpm._support.threads import raise_if_abandoned
 from nmpm.data.array_checks import check_end
 from nmpm.data.fields import check_finite, read_fields, require_fields
-from nmpm.data.format import Metadata, Split, Trajectory
+from nmpm.data.format import ID, Metadata, Split, Trajectory
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.loading.presence import Presence, find_tracks, obstacle_frames
 from nmpm.data.split_files import split_paths
@@ -45,6 +47,8 @@ class Recording:
     tracks: np.ndarray | None = None  # (K, 3) where some are absent, see `find_tracks`: a column may hold several
     obstacle_frames: Tensor | None = None  # (T, M, D) float32; None where no obstacle of the scene moves
     volume: Tensor | None = None  # (N,) float32 volumes as multiples of the scene's `particle_volume`; None for 1
+    # (K + M, 2) column and first frame in the trajectory: of particles or tracks, then of obstacles
+    source: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
 
 
 @dataclass(frozen=True)
@@ -87,6 +91,7 @@ class RecordingReader:
             presence.check(where)
             moving[moving] = presence.ever
             position = presence.fill(position[:, presence.ever])
+        tracks = None if presence is None else find_tracks(presence.present, None if ids is None else ids[:, moving])
         obstacles = obstacle_frames(trajectory.position[:, obstacle], self.scene.moving_obstacles)
         volume = stated_volumes(trajectory, self.scene.particle_volume, where) if volume is None else volume
         return Recording(
@@ -96,9 +101,10 @@ class RecordingReader:
             gravity=(torch.tensor(gravity, dtype=torch.float64) * self.scene.dt**2).float(),
             fields=self._fields(trajectory.fields, moving, presence, where),
             present=None if presence is None else torch.from_numpy(presence.present),
-            tracks=None if presence is None else find_tracks(presence.present, None if ids is None else ids[:, moving]),
+            tracks=tracks,
             obstacle_frames=torch.from_numpy(obstacles) if self.scene.moving_obstacles else None,
             volume=None if volume is None else torch.from_numpy(check_positive(volume, moving, where)),
+            source=_source(trajectory.position, moving, obstacle, tracks),
         )
 
     def _check_rest(self, trajectory: Trajectory, where: str) -> None:
@@ -172,6 +178,15 @@ class RecordingReader:
         return index
 
 
+def _source(position: np.ndarray, moving: np.ndarray, obstacle: np.ndarray, tracks: np.ndarray | None) -> np.ndarray:
+    """`Recording.source`, of which obstacles that are in no frame are left out."""
+    obstacle = np.flatnonzero(obstacle & ~np.isnan(position[..., 0]).all(axis=0))
+    columns = np.flatnonzero(moving)
+    first = np.zeros_like(columns) if tracks is None else tracks[:, 1]
+    columns = columns if tracks is None else columns[tracks[:, 0]]
+    return np.stack([np.concatenate([columns, obstacle]), np.concatenate([first, np.zeros_like(obstacle)])], axis=1)
+
+
 class SplitRecordings(Sequence[Recording]):
     """Trajectories of a split as recordings, read and validated on access.
 
@@ -207,6 +222,22 @@ class SplitRecordings(Sequence[Recording]):
         trajectory = replace(self.split.read(index), fields=fields)
         ids = self.split.tracks(index) if np.isnan(trajectory.position[..., 0]).any() else None
         return self.reader.recording(trajectory, self.split.where(index), self._relative_volumes(index), ids)
+
+    def as_recorded(self, predicted: Trajectory, index: int) -> Trajectory:
+        """A prediction of the trajectory of an index, with the ids and types that its particles have in the data."""
+        (column, frame), metadata = self.at(index).source.T, self.reader.metadata
+        ids = np.broadcast_to(self.split.ids(index), (self.split.frames(index), self.split.particles(index)))
+        facts: dict[str, Any] = {
+            "particle_types": json.dumps(metadata.particle_types),
+            "static_types": np.array(sorted(metadata.static_types), dtype=np.int64),
+            "prescribed_types": np.array(sorted(metadata.prescribed_types), dtype=np.int64),
+        }
+        return replace(
+            predicted,
+            particle_type=self.split.particle_type(index)[column],
+            attributes=predicted.attributes | facts,
+            fields=predicted.fields | {ID: ids[frame, column]},
+        )
 
     @cached_property
     def _mean_volume(self) -> float | None:

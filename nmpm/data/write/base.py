@@ -23,10 +23,12 @@ class TrajectoryWriter(abc.ABC):
     Attributes:
         readers: Programs that open the file, in words.
         holds_all_fields: Also those that are not of particles.
+        holds_text_ids: Ids that are texts; others number the particles.
     """
 
     readers: ClassVar[str]
     holds_all_fields: ClassVar[bool] = False
+    holds_text_ids: ClassVar[bool] = False
 
     @abc.abstractmethod
     def write(

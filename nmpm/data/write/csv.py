@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar
@@ -16,8 +17,9 @@ from nmpm.data.write.text import columns, rows
 
 
 class Csv(TrajectoryWriter):
-    """Columns `frame, time, id, type, x, y[, z], vx, …`, and one for each field."""
+    """Columns `frame, time, id, type, x, y[, z], vx, …`, one for each field, and the type's name as `material`."""
 
+    holds_text_ids: ClassVar[bool] = True
     readers: ClassVar[str] = "spreadsheets, pandas, R"
 
     def write(
@@ -27,8 +29,17 @@ class Csv(TrajectoryWriter):
             for number, frame in enumerate(frames(trajectory, metadata)):
                 count, named = len(frame.index), columns(frame, metadata.dim)
                 if number == 0:
-                    file.write(",".join(("frame", "time", "id", "type", *named)) + "\n")
-                head = (np.full(count, number), np.full(count, frame.time), frame.index, frame.particle_type)
-                file.write(rows([*head, *named.values()], ","))
+                    file.write(",".join(("frame", "time", "id", "type", *named, "material")) + "\n")
+                head = [np.full(count, number), np.full(count, frame.time), _quoted(frame.label), frame.particle_type]
+                material = _quoted(np.array([metadata.particle_types.get(i, "") for i in frame.particle_type.tolist()]))
+                file.write(rows([*head, *named.values(), material], ","))
                 step()
         return path
+
+
+def _quoted(cells: np.ndarray) -> np.ndarray:
+    """Cells, texts with a comma or quotation mark in quotation marks."""
+    if cells.dtype.kind != "U":
+        return cells
+    special = np.array([re.search('[,"\\n]', text) is not None for text in cells.tolist()], bool)
+    return np.where(special, np.char.add(np.char.add('"', np.char.replace(cells, '"', '""')), '"'), cells)

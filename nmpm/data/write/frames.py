@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from nmpm.data.format import TRUTH, Metadata, Trajectory
+from nmpm.data.format import ID, TRACK, TRUTH, Metadata, Trajectory
 from nmpm.data.statistics import displacements
 
 
@@ -19,6 +19,8 @@ class Frame:
     number: int  # from 0 on
     time: float
     index: np.ndarray  # (n,) int64, of each particle in the trajectory, from 0 on
+    id: np.ndarray  # (n,) int64 that the data call them by; the index where they have no numbers
+    label: np.ndarray  # (n,) the same, or texts where the data call them by texts
     particle_type: np.ndarray  # (n,) int64
     position: np.ndarray  # (n, 3) float32; z is 0 in two dimensions
     fields: dict[str, np.ndarray]  # (n,) or, of vectors, (n, 3) by name; with `velocity`, in length per time
@@ -37,7 +39,8 @@ def particle_fields(trajectory: Trajectory) -> dict[str, np.ndarray]:
     """
     frames, particles, dim = trajectory.position.shape
     shapes = [(frames, particles), (particles,), (frames, particles, dim), (particles, dim)]
-    fields = {name: np.asarray(values) for name, values in trajectory.fields.items() if name != "time"}
+    beside = ("time", ID, TRACK)
+    fields = {name: np.asarray(values) for name, values in trajectory.fields.items() if name not in beside}
     if TRUTH in fields and fields[TRUTH].shape[1:] == (particles, dim):
         truth = np.full((frames, particles, dim), np.nan, dtype=np.float32)
         truth[: len(fields[TRUTH])] = fields[TRUTH][:frames]
@@ -47,13 +50,15 @@ def particle_fields(trajectory: Trajectory) -> dict[str, np.ndarray]:
 
 def fields_left_out(trajectory: Trajectory) -> list[str]:
     """Names of the fields that frames do not have, as they are not of particles or of other frames."""
-    return sorted(set(trajectory.fields) - {"time"} - set(particle_fields(trajectory)))
+    beside = {"time", TRACK, *({ID} if trajectory.fields.get(ID, np.zeros(0)).dtype.kind != "S" else ())}
+    return sorted(set(trajectory.fields) - beside - set(particle_fields(trajectory)))
 
 
 def frames(trajectory: Trajectory, metadata: Metadata) -> Iterator[Frame]:
     """Yields the frames; velocities that are not recorded are those of `frame_velocities`."""
     position, fields = trajectory.position, particle_fields(trajectory)
     velocities = frame_velocities(trajectory, metadata)
+    ids, labels = trajectory.ids(), trajectory.ids("iuS")
     for number, moment in enumerate(frame_times(trajectory, metadata)):
         (index,) = np.nonzero(~np.isnan(position[number, :, 0]))
         velocity = {} if "velocity" in fields else {"velocity": next(velocities)}
@@ -62,6 +67,8 @@ def frames(trajectory: Trajectory, metadata: Metadata) -> Iterator[Frame]:
             number,
             float(moment),
             index,
+            ids[number, index],
+            labels[number, index],
             trajectory.particle_type[index],
             pad(position[number, index]),
             {name: values[index] if values.ndim == 1 else pad(values[index]) for name, values in now.items()},

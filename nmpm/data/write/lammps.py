@@ -14,14 +14,14 @@ from nmpm.data.write.text import columns, rows
 
 
 class LammpsDump(TrajectoryWriter):
-    """One file of all frames, `id type x y z vx vy vz` and a column for each field; ids begin at 1."""
+    """One file of all frames, `id type x y z vx vy vz` and a column for each field; ids the data's, or from 1 on."""
 
     readers: ClassVar[str] = "OVITO, VMD"
 
     def write(
         self, path: Path, trajectory: Trajectory, metadata: Metadata, step: Callable[[], object] = no_step
     ) -> Path:
-        box = _box(metadata)
+        box, ids = _box(metadata), trajectory.ids(first=1)
         with atomic_write(path) as part, part.open("w", encoding="utf-8") as file:
             for number, frame in enumerate(frames(trajectory, metadata)):
                 named = columns(frame)
@@ -29,7 +29,7 @@ class LammpsDump(TrajectoryWriter):
                     f"ITEM: TIME\n{frame.time!r}\nITEM: TIMESTEP\n{number}\n"
                     f"ITEM: NUMBER OF ATOMS\n{len(frame.index)}\n{box}ITEM: ATOMS id type {' '.join(named)}\n"
                 )
-                file.write(rows([frame.index + 1, frame.particle_type, *named.values()], " "))
+                file.write(rows([ids[number, frame.index], frame.particle_type, *named.values()], " "))
                 step()
         return path
 

@@ -9,6 +9,7 @@ import numpy as np
 from nmpm.data.write.frames import Frame
 
 _AXES = "xyz"
+_PATTERNS = {"f": "%.9g", "U": "%s"}
 
 
 def columns(frame: Frame, dim: int = 3) -> dict[str, np.ndarray]:
@@ -25,6 +26,6 @@ def columns(frame: Frame, dim: int = 3) -> dict[str, np.ndarray]:
 
 
 def rows(numbers: list[np.ndarray], separator: str) -> str:
-    """A line for each of n particles, of (n,) arrays; float32 are read back exactly."""
-    pattern = separator.join("%.9g" if array.dtype.kind == "f" else "%d" for array in numbers) + "\n"
+    """A line for each of n particles, of (n,) arrays of numbers or texts; float32 are read back exactly."""
+    pattern = separator.join(_PATTERNS.get(array.dtype.kind, "%d") for array in numbers) + "\n"
     return "".join(map(pattern.__mod__, zip(*(array.tolist() for array in numbers), strict=True)))

@@ -66,7 +66,7 @@ class _Cloud:
             return
         position = frame.fields[TRUTH] if self.truth else frame.position
         part = (frame.particle_type == self.type_id) & ~np.isnan(position[:, 0])
-        if (ids := _list(frame.index[part])) != self.ids:
+        if (ids := _list(frame.id[part])) != self.ids:
             self.ids = ids
             self._sample("int64[] ids", code, ids)
         self._sample("point3f[] points", code, _list(position[part]))

@@ -61,7 +61,7 @@ def vtp(frame: Frame) -> bytes:
             f'<DataArray type="{_VTK_TYPES[kind]}" Name="{escape(name)}"{parts} format="appended" offset="{offset}"/>\n'
         )
 
-    data = {"id": frame.index, "particle_type": frame.particle_type, **frame.fields}
+    data = {"id": frame.id, "particle_type": frame.particle_type, **frame.fields}
     text = (
         f'{_HEAD.format("PolyData")}<PolyData>\n<Piece NumberOfPoints="{count}" NumberOfVerts="{count}">\n'
         f"<Points>\n{array('Points', frame.position)}</Points>\n"

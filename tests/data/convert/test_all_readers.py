@@ -7,8 +7,8 @@ import h5py
 import numpy as np
 import pytest
 
-from nmpm.data.convert import open_dataset
-from nmpm.data.format import Trajectory
+from nmpm.data.convert import convert, open_dataset
+from nmpm.data.format import Split, Trajectory
 
 T, N = 12, 6
 Arrays = Mapping[str, np.ndarray]
@@ -35,7 +35,7 @@ def rows(columns: Mapping[str, np.ndarray], separator: str, first: int = 0) -> s
 def write_tracks(path: Path, position: np.ndarray, arrays: Arrays) -> Path:
     sizes, separator = position.shape[:2], "\t" if path.suffix == ".tsv" else ","
     frame, particle = np.mgrid[: sizes[0], : sizes[1]]
-    columns = columns_of(position, {"frame": frame, "particle": particle, **arrays})
+    columns = columns_of(position, {"frame": frame, **({} if "id" in arrays else {"particle": particle}), **arrays})
     path.write_text(separator.join(columns) + "\n" + rows({n: v.reshape(-1) for n, v in columns.items()}, separator))
     return path
 
@@ -212,3 +212,27 @@ def test_types_and_masks_may_have_an_axis_of_one(tmp_path, name, shape):
     assert run.particle_type.tolist() == [3, 3, 4, 4, 5, 5]
     np.testing.assert_array_equal(run.fields["heat"], heat.reshape(particles))
     np.testing.assert_array_equal(run.fields["time"], np.arange(T) * 0.5)
+
+
+def test_particles_keep_their_ids_in_whatever_order_frames_have_them(write, tmp_path):
+    rng, position, ids = np.random.default_rng(1), made(), np.array([70, 3, 51, 9, 12, 8])
+    types, there = ids % 2 + 1, np.ones((T, N), bool)
+    there[:5, 2] = there[8:, 0] = False  # one that appears late, one that leaves
+    order = rng.permuted(np.tile(np.arange(N), (T, 1)), axis=1)
+    at = np.arange(T)[:, None], order
+    path = write(position[at], id=ids[order], type=types[order], active=there[at].astype(int))
+    convert(path, tmp_path / "out")
+    run = Split(tmp_path / "out" / "train.h5").read_with_fields(0)
+    column = np.argsort(ids)
+    assert run.ids()[0].tolist() == sorted(ids.tolist())
+    assert run.particle_type.tolist() == types[column].tolist()
+    expected = np.where(there[..., None], position, np.nan)[:, column]
+    np.testing.assert_allclose(run.position, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["tracks.csv", "run.npz"])
+def test_ids_may_be_texts(tmp_path, name):
+    ids = np.array([f"grain {letter}" for letter in "fcaebd"])
+    run = read(WRITERS[name](tmp_path / name, made(), {"id": ids}))
+    column = [run.ids("S")[0].tolist().index(label) for label in ids]
+    np.testing.assert_allclose(run.position[:, column], made(), atol=1e-6)

@@ -2,6 +2,7 @@
 
 import csv
 import time
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -10,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nmpm.data.convert import convert
+from nmpm.data.convert import convert, open_dataset
 from nmpm.data.format import Metadata, Split, Trajectory, read_metadata
 from nmpm.data.write import WRITERS, find_writer
 from nmpm.data.write.frames import fields_left_out
@@ -161,6 +162,39 @@ def test_what_is_read_back_has_the_same_time_step(suffix, dt, dim):
 
 def test_fields_that_frames_cannot_have_are_named():
     assert fields_left_out(made()) == ["misfit"]
+    labelled = replace(made(), fields={"id": np.array([b"a", b"b", b"c", b"d"])})
+    assert fields_left_out(labelled) == ["id"]
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".lammpstrj", ".vtp", ".vtkhdf", ".npz", ".h5"])
+@pytest.mark.parametrize("shared", [False, True])
+def test_particles_keep_their_ids_and_types(tmp_path, suffix, shared):
+    """By which positions are joined, also of particles that come late or share a column."""
+    if suffix == ".vtp":
+        pytest.importorskip("pyvista")
+    ids, run = np.tile([41, 7, 30, 12], (FRAMES, 1)), made(absent=True)
+    if shared:
+        run.position[2] = np.nan
+        run.position[2, 0] = 0.5
+        ids[3:, 1:] += 100
+    stored = {"track": np.where(np.isnan(run.position[..., 0]), -1, ids)} if shared else {"id": ids[0]}
+    file = write(tmp_path / f"out{suffix}", replace(run, fields=stored))
+    back = next(iter(open_dataset(file).splits.values()))
+    (read,) = back()
+    for frame in range(FRAMES):
+        here, there = (np.flatnonzero(~np.isnan(one.position[frame, :, 0])) for one in (read, run))
+        here, there = here[np.argsort(read.ids()[frame, here])], there[np.argsort(ids[frame, there])]
+        assert read.ids()[frame, here].tolist() == ids[frame, there].tolist()
+        assert read.particle_type[here].tolist() == TYPES[there].tolist()
+        np.testing.assert_array_equal(read.position[frame, here], run.position[frame, there])
+
+
+def test_csv_has_the_names_of_types_and_ids_that_are_texts(tmp_path):
+    labels = np.char.encode(np.array(["a", 'b "2", left', "ä", "d"]), "utf-8")
+    with write(tmp_path / "out.csv", replace(made(), fields={"id": labels})).open(encoding="utf-8") as file:
+        table = list(csv.DictReader(file))[:4]
+    assert [row["id"] for row in table] == ["a", 'b "2", left', "ä", "d"]
+    assert [row["material"] for row in table] == [METADATA.particle_types[number] for number in TYPES.tolist()]
 
 
 @pytest.mark.parametrize("suffix", WRITERS)
