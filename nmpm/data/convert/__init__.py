@@ -36,6 +36,7 @@ from nmpm.data.convert.neuralmpm import NeuralMpm
 from nmpm.data.convert.ply import Ply
 from nmpm.data.convert.retiming import retime
 from nmpm.data.convert.rollout_pickle import RolloutPickle
+from nmpm.data.convert.tecplot import Tecplot
 from nmpm.data.convert.tracks import Tracks
 from nmpm.data.convert.vtk import Vtk
 from nmpm.data.convert.vtkhdf import VtkHdf
@@ -68,6 +69,7 @@ FORMATS: tuple[DatasetFormat, ...] = (
     Lammps(),
     Xyz(),
     Gsd(),
+    Tecplot(),
 )
 
 

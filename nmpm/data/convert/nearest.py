@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
@@ -36,13 +38,86 @@ HINTS: Mapping[str, str] = {
         (".feather", "write it as .parquet: a row for each particle in each frame, with frame, id, x, y"),
         (".xtc .trr .dcd .pdb", "MDAnalysis, ase or OVITO write it as .xyz or as a LAMMPS dump, which are read"),
         (
-            ".bgeo .sc .abc .usd .usda .usdc .obj",
-            "Houdini or Blender write it as a .ply file per frame, which are read",
+            ".bgeo .sc .abc .usd .usda .usdc .obj .vdb",
+            "Houdini or Blender write it as a .ply file per frame, which are read; SPlisHSPlasH writes VTK where its"
+            " scene says enableVTKExport, and its tool partio2vtk converts .bgeo",
         ),
+        (
+            ".bphys",
+            "caches of Blender: let a script save each frame's particle locations by"
+            ' np.save(f"run0/{frame:04}.npy", locations), (N, 3)',
+        ),
+        (
+            ".bi4 .ibi4",
+            "DualSPHysics's PartVTK writes them as VTK: PartVTK -dirdata data -savevtk particles/PartFluid"
+            " -onlytype:-all,+fluid, and -savevtk particles/PartBound -onlytype:-all,+bound",
+        ),
+        (
+            ".pvtp .pvtu .vtm .vtmb .vtr .vti .xdmf .xmf .xdmf3 .case .exo .e .ex2 .plt .szplt .silo .foam",
+            "open it in ParaView, apply Merge Blocks or Extract Surface where it has parts, and File, Save Data as .vtp"
+            " or .csv with all time steps",
+        ),
+        (
+            ".odb",
+            "Abaqus's own Python (abaqus python script.py, odbAccess) writes a .csv with frame, id, x, y, z of each"
+            " particle or node",
+        ),
+        (".d3plot .rst .cas .sim .dem .rocky20 .rocky", f"export .csv, with frame or time, id, x, y, z; or {_WRITE}"),
+        (".pcd .las .laz .e57", "CloudCompare or Open3D write it as a .ply file per frame, which are read"),
+        (
+            ".lammpsbin .bin",
+            f"binary dumps of LAMMPS become text by its tool binary2txt; others you load yourself, then {_WRITE}",
+        ),
+        (".rds .rdata", "write it as .parquet or .csv: a row for each particle in each frame, with frame, id, x, y"),
     )
     for suffix in suffixes.split()
 }
 """How to get from files of a suffix to a form that is read."""
+
+_BY_NAME: Mapping[str, str] = {
+    r"ptv_is\.\d+|rt_is\.\d+": (
+        "OpenPTV's files: in Python, flowtracks.io.trajectories_ptvis('ptv_is.%d') reads them; write a .csv of the"
+        " columns frame, id, x, y, z: trajectory.time(), trajectory.trajid(), trajectory.pos()"
+    ),
+    r"lagrangian/[^/]+/(positions|coordinates|U|origId)(\.gz)?": (
+        "OpenFOAM's clouds: foamToVTK writes them as VTK: nmpm inspect CASE/VTK/lagrangian/CLOUD"
+    ),
+    r"[^/]+\.data(\.\d+)?": (
+        f"where it is MercuryDPM's, its tool data2pvd writes a .pvd with its files, which are read; else {_WRITE}"
+    ),
+}
+"""The same by names that have no suffix of their own."""
+
+_PYSPH = (
+    "Write HDF5: from pysph.solver.utils import dump, load; data = load(file); dump(file.replace('.npz', '.hdf5'),"
+    " list(data['arrays'].values()), data['solver_data'])."
+)
+_UNPACK: Mapping[str, str] = {
+    ".zip": "python -m zipfile -e {file} {folder}",
+    **dict.fromkeys(
+        (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz"),
+        "mkdir -p {folder} && tar -xf {file} -C {folder}",
+    ),
+    ".7z": "7z x {file} -o{folder}",
+    ".rar": "unrar x {file} {folder}/",
+}
+_DECOMPRESS: Mapping[str, str] = {".gz": "gunzip -k", ".bz2": "bunzip2 -k", ".xz": "unxz -k", ".zst": "unzstd"}
+
+
+def _unpacking(path: Path, file: Path) -> str | None:
+    """The commands that unpack an archive or a compressed file and read it; None for other files."""
+    end = next((end for end in sorted(_UNPACK, key=len, reverse=True) if file.name.lower().endswith(end)), None)
+    if end is not None:
+        folder = file.with_name(file.name[: -len(end)])
+        command = _UNPACK[end].format(file=shlex.quote(str(file)), folder=shlex.quote(str(folder)))
+        data = path if path.is_dir() else folder
+        others = " Unpack others beside it likewise." if path.is_dir() else ""
+        return f"{file}: archives are not unpacked: {command} && nmpm inspect {shlex.quote(str(data))}.{others}"
+    if (tool := _DECOMPRESS.get(file.suffix.lower())) is not None:
+        data = path if path.is_dir() else file.with_suffix("")
+        quoted = shlex.quote(str(file))
+        return f"{file}: it is compressed: {tool} {quoted} && nmpm inspect {shlex.quote(str(data))}."
+    return None
 
 
 def describe_unknown(path: Path) -> str:
@@ -52,6 +127,12 @@ def describe_unknown(path: Path) -> str:
         return f"{path}: no known format; the folder is empty. {_PAGE}"
     suffix = Counter(file.suffix.lower() for file in files).most_common(1)[0][0]
     first = next(file for file in files if file.suffix.lower() == suffix)
+    if (unpacking := _unpacking(path, first)) and not any(first.match(pattern) for pattern in SUFFIXES):
+        return f"{unpacking} {_PAGE}"
+    for file in files:
+        for pattern, hint in _BY_NAME.items():
+            if re.search(rf"/({pattern})$", file.absolute().as_posix()):
+                return f"{file}: {hint}. {_PAGE}"
     if suffix in HINTS:
         return f"{first}: {suffix} files are not read: {HINTS[suffix]}. {_PAGE}"
     if any(first.match(pattern) for pattern in ArrayFiles.patterns):
@@ -104,6 +185,8 @@ def _array_problem(file: Path) -> str:
 
 def _wrong_positions(arrays: Arrays) -> str | None:
     """What is wrong with the shape of the array that is called positions, or else of the largest one."""
+    if {"particles", "solver_data"} <= set(arrays):
+        return f"PySPH's .npz holds Python objects, which are not unpickled. {_PYSPH}"
     leaves = {name.rpartition("/")[2]: name for name in reversed(list(arrays))}
     named = [leaves[leaf] for leaf in with_meaning("position", leaves)]
     numbers = [name for name, array in arrays.items() if array.dtype.kind in "fiuO"]

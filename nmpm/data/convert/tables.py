@@ -15,6 +15,7 @@ from nmpm._support.bounded_files import check_regular
 from nmpm._support.messages import install, one_line
 from nmpm._support.progress import progress_bar
 from nmpm.data.convert.base import readable
+from nmpm.data.convert.named_arrays import component_names
 from nmpm.data.convert.text_lines import Lines, is_number, open_lines, text_array
 from nmpm.errors import ConfigError, DataError
 
@@ -116,8 +117,11 @@ def _cells_error(path: Path, lines: list[str], first: int, count: int, delimiter
 
 
 def _header(lines: Lines) -> tuple[tuple[str, ...], str | None]:
-    """Names of columns, and the delimiter (None for blanks), which a first line such as "sep=;" may state."""
-    stated = None
+    """Names of columns, and the delimiter (None for blanks), which a first line such as "sep=;" may state.
+
+    They are in the first line with text, or in a later one that has coordinates, below facts of the whole file.
+    """
+    stated, first = None, None
     for _ in range(100):
         text = lines.next().strip().lstrip("#%").strip()
         if spreadsheet := re.fullmatch('"?sep=(.?)"?', text, re.IGNORECASE):
@@ -127,9 +131,11 @@ def _header(lines: Lines) -> tuple[tuple[str, ...], str | None]:
             continue
         delimiter = stated or next((sign for sign in "\t;," if sign in text), None)
         names = [name or f"column {index}" for index, name in enumerate(_split(text, delimiter))]  # pandas' index
-        named = len(set(names)) == len(names) and not any(map(is_number, names))
-        return (tuple(names) if named and len(names) > 1 else (), delimiter)
-    return (), None
+        named = len(set(names)) == len(names) > 1 and not any(map(is_number, names))
+        if named and component_names({plain_column(name): name for name in names}, "position"):
+            return tuple(names), delimiter
+        first = first or (tuple(names) if named else (), delimiter)
+    return first or ((), None)
 
 
 def _split(text: str, delimiter: str | None) -> list[str]:
