@@ -8,6 +8,7 @@ one for each particle, such as a temperature, or one for each scene, such as a f
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -64,6 +65,11 @@ class Particles(Batched):
         obstacle_share: (B, M) how much of a particle's volume each obstacle particle stands for; None for all of it.
             Bodies that are rasterised softly (`nmpm.emulator.bodies`) have shares, and gradients through them.
 
+    Attributes:
+        budget: (B,) energy per mass of the first state of the rollout that led here, which the frames after this one
+            may not exceed either, in length² per frame² from the domain's lower corner; None for this state's own.
+            A state that is made of this one by `replace` or `with_motion` has its own.
+
     Raises:
         ValueError: if the shapes do not fit together.
     """
@@ -79,6 +85,7 @@ class Particles(Batched):
     obstacle_share: Tensor | None = None
     obstacle_velocity: Tensor | None = None
     volume: Tensor | None = None
+    budget: Tensor | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         batch, count, dim = self.position.shape
@@ -94,12 +101,15 @@ class Particles(Batched):
         Raises:
             ValueError: if some have fields, volumes, shares or velocities of obstacles that others lack.
         """
-        tensors = [{name: v for name, v in vars(state).items() if isinstance(v, Tensor)} for state in states]
+        plain = [state.with_budget(None) for state in states]
+        tensors = [{name: v for name, v in vars(state).items() if isinstance(v, Tensor)} for state in plain]
         for kind, have in (("tensors", tensors), ("fields", [state.fields for state in states])):
             if differ := set[str]().union(*have).difference(set(have[0]).intersection(*have)):
                 raise ValueError(f"Not all of the states to stack have the {kind} {', '.join(sorted(differ))}.")
         fields = {name: _stacked([state.fields[name] for state in states]) for name in states[0].fields}
-        return cls(**{name: _stacked([each[name] for each in tensors]) for name in tensors[0]}, fields=fields)
+        stacked = cls(**{name: _stacked([each[name] for each in tensors]) for name in tensors[0]}, fields=fields)
+        budgets = [state.budget for state in states if state.budget is not None]
+        return stacked.with_budget(torch.cat(budgets) if len(budgets) == len(states) else None)
 
     @property
     def present_volume(self) -> Tensor:
@@ -109,6 +119,39 @@ class Particles(Batched):
     def with_motion(self, position: Tensor, velocity: Tensor) -> Particles:
         """The same particles elsewhere: (B, N, D) positions and velocities."""
         return dataclasses.replace(self, position=position, velocity=velocity)
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Particles:
+        if self.budget is None:
+            return super().map(change)
+        return self.with_budget(None).map(change).with_budget(change(self.budget))
+
+    def with_budget(self, budget: Tensor | None) -> Particles:
+        """The same state with an energy (B,) that rollouts from it may have, see `budget`."""
+        same = copy.copy(self)
+        object.__setattr__(same, "budget", budget)
+        return same
+
+    def with_padding_at(self, point: Sequence[float]) -> Particles:
+        """The same state with its padding at rest at a point (D,), whatever it held: NaN times 0 is NaN.
+
+        Without padding, on a CPU, the state itself.
+        """
+        if self.mask.device.type == "cpu" and bool(self.mask.all()) and bool(self.obstacle_mask.all()):
+            return self
+        real, solid, at = self.mask, self.obstacle_mask, self.position.new_tensor(point)
+        moved, share = self.obstacle_velocity, self.obstacle_share
+        fields = {name: v if v.shape[1] != real.shape[1] else v.where(real, 0.0) for name, v in self.fields.items()}
+        return dataclasses.replace(
+            self,
+            position=self.position.where(real.unsqueeze(-1), at),
+            velocity=self.velocity.where(real.unsqueeze(-1), 0.0),
+            material=self.material.where(real, 0),
+            obstacle=self.obstacle.where(solid.unsqueeze(-1), at.to(self.obstacle)),
+            fields=fields,
+            volume=None if self.volume is None else self.volume.where(real, 1.0),
+            obstacle_share=None if share is None else share.where(solid, 0.0),
+            obstacle_velocity=None if moved is None else moved.where(solid.unsqueeze(-1), 0.0),
+        ).with_budget(self.budget)
 
     def with_fields(self, fields: Mapping[str, Tensor]) -> Particles:
         """The same particles with some fields replaced or added: (B, N) or (B, 1) by name."""

@@ -23,23 +23,29 @@ class Bundle:
         position: (B, m, N, D) in domain length, of the precision of the positions that the emulator was given.
         velocity: (B, N, D) at the last frame, in length per frame.
         fields: (B, m, N) of each evolving field, by name, in its own unit.
+        budget: (B,) energy that the rollout may have, see `Particles.budget`; None where it is not constrained.
     """
 
     position: Tensor
     velocity: Tensor
     fields: Mapping[str, Tensor] = field(default_factory=dict)
+    budget: Tensor | None = None
 
     def without_absent(self, there: Tensor) -> Bundle:
         """The same with NaN for positions and fields of particles that are not `there`, (B, m, N) or (B, 1, N) bool."""
         position = torch.where(there.unsqueeze(-1), self.position, torch.nan)
         fields = {name: torch.where(there, values, torch.nan) for name, values in self.fields.items()}
-        return Bundle(position, self.velocity, fields)
+        return Bundle(position, self.velocity, fields, self.budget)
 
     def state_after(self, particles: Particles) -> Particles:
-        """The state at the bundle's last frame, of the particles that it started from."""
+        """The state at the bundle's last frame, of the particles that it started from.
+
+        A rollout from there goes on as the one that led there.
+        """
         moved = particles.with_motion(self.position[:, -1], self.velocity)
         last = {name: values[:, -1] for name, values in self.fields.items()}
-        return moved.with_fields(last) if last else moved
+        moved = moved.with_fields(last) if last else moved
+        return moved if self.budget is None else moved.with_budget(self.budget)
 
 
 @dataclass(frozen=True)

@@ -235,9 +235,14 @@ class Emulator(nn.Module):
         return solid_fraction(self.scene, self.grid, self.transfer, particles, self.walls)
 
     def budget(self, particles: Particles) -> Tensor | None:
-        """Energy per mass (B,) of a state, in grid units; None where it is not constrained, as in training."""
+        """Energy per mass (B,) that rollouts from a state may have, in grid units; None where it is not constrained.
+
+        Its own, or that of the first state of the rollout that led there. Trainings do not constrain it.
+        """
         if not self.constraints.energy or self.training:
             return None
+        if particles.budget is not None:
+            return (particles.budget / self.grid.spacing[0] ** 2).to(self.precision)
         cells, velocity, gravity = self.grid.isotropic_units(*self.in_cells(particles))
         share = mass_shares(self.scene, particles.material, particles.present_volume, cells.dtype)
         return energy(cells, velocity, gravity, share)
@@ -276,13 +281,27 @@ class Emulator(nn.Module):
 
     def forward(self, particles: Particles, context: RolloutContext | None = None) -> Bundle:
         """Predict the next m frames from a state; the context is that of the rollout's first state, or of this one."""
-        context = self.context(particles) if context is None else context
+        if context is None:
+            particles = self.with_plain_padding(particles)
+            context = self.context(particles)
         if self.thread_choice is None:
-            return self.recorded_calls.predict(self, particles, context)
+            return self._with_budget(self.recorded_calls.predict(self, particles, context), context.budget)
         self.thread_choice.start()
         bundle = self.recorded_calls.predict(self, particles, context)
         self.thread_choice.stop()
-        return bundle
+        return self._with_budget(bundle, context.budget)
+
+    def with_plain_padding(self, particles: Particles) -> Particles:
+        """A state whose padding rests in the middle of the domain, whatever it held."""
+        return particles.with_padding_at([(low + high) / 2 for low, high in self.scene.domain])
+
+    def _with_budget(self, bundle: Bundle, budget: Tensor | None) -> Bundle:
+        """The bundle with the energy (B,), in grid units, that limited it."""
+        if budget is None:
+            return bundle
+        # In float64, where there is one, the grid units come back to the bit.
+        exact = budget.detach() if budget.device.type == "mps" else budget.detach().double()
+        return dataclasses.replace(bundle, budget=exact * self.grid.spacing[0] ** 2)
 
     def predict(self, particles: Particles, context: RolloutContext) -> Bundle:
         """The bundle, with only the network left to the runtime."""

@@ -34,7 +34,8 @@ class Periods:
             turns = torch.floor((columns[axis].detach() - low) / (high - low))
             columns[axis] = columns[axis] - turns * (high - low)
             self._turns[axis] = self._turns[axis] + turns if axis in self._turns else turns
-        return particles.with_motion(torch.stack(columns, dim=-1), particles.velocity)
+        wrapped = particles.with_motion(torch.stack(columns, dim=-1), particles.velocity)
+        return wrapped.with_budget(particles.budget)
 
     def forget(self, particles: Tensor) -> None:
         """Count from zero for some particles, True in (B, N): they are at another place."""

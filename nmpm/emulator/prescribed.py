@@ -161,6 +161,7 @@ class Exchange:
 
     def start(self, particles: Particles) -> Particles:
         """The state that a rollout starts from."""
+        particles = self._emulator.with_plain_padding(particles)
         if self.prescribed is None:
             return particles
         self.prescribed.check(particles)

@@ -83,7 +83,8 @@ class _Calls:
             moving = self._emulator(particles.scenes(self._moving), self._call_context())
             fields = {name: self._put(values, moving.fields[name]) for name, values in self._last.fields.items()}
             position = self._put(self._last.position, moving.position)
-            self._last = Bundle(position, self._put(self._last.velocity, moving.velocity), fields)
+            velocity = self._put(self._last.velocity, moving.velocity)
+            self._last = Bundle(position, velocity, fields, self._last.budget)
         return self._last
 
     def _call_context(self) -> RolloutContext:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from nmpm.emulator.constraints import at_rest, energy, mass_shares
 from nmpm.emulator.engines.torch.energy import EnergyLimit, affordable_share
 from nmpm.emulator.rollouts import differentiable_rollout, rollout, unroll
 from nmpm.errors import ConfigError
+from nmpm.particles import Particles
 from nmpm.transfer import without_kernels
 from tests.scenes import box, cloud, emulator_of, padded
 
@@ -56,6 +58,41 @@ def test_the_affordable_part_of_a_way():
     before, after = torch.tensor([[1.0, 1.0]] * 4), torch.tensor([[1.5, 2.0], [3.0, 2.0], [0.0, 0.5], [9.0, 9.0]])
     budget = torch.tensor([2.0, 2.0, 0.7, 0.5])
     torch.testing.assert_close(affordable_share(before, after, budget), torch.tensor([1.0, 0.5, 1.0, 0.0]))
+
+
+@pytest.mark.parametrize("kernels", [True, False], ids=["kernels", "tensors"])
+@pytest.mark.parametrize(
+    "held",
+    [
+        {"energy": True, "rest_speed": 0.01}, {"energy": True, "rest_speed": 0.005, "density_cap": 3.0},
+        {"energy": True}, {"rest_speed": 0.02}, {"density_cap": 0.3}, {},
+    ],
+    ids=str,
+)  # fmt: skip
+@pytest.mark.parametrize("cells", [16, (12, 18)], ids=["square", "oblong"])
+@torch.no_grad()
+def test_a_rollout_goes_on_from_each_of_its_bundles_as_if_never_interrupted(kernels, held, cells):
+    scene = box(obstacles=True)
+    emulator, state = emulator_of(scene, cells, scale=2.0, **held), cloud(scene, 200, batch=2, speed=0.01, statics=9)
+    with nullcontext() if kernels else without_kernels():
+        whole = torch.cat([bundle.position for bundle in unroll(emulator, state, 5)], dim=1)
+        for bundles in range(1, 5):
+            (last,) = unroll(emulator, state, 1)
+            state = last.state_after(state)
+            rest = rollout(emulator, state, (5 - bundles) * emulator.frames)
+            assert torch.equal(rest, whole[:, bundles * emulator.frames :])
+
+
+def test_a_state_that_is_changed_has_an_energy_of_its_own():
+    scene = box()
+    emulator, state = emulator_of(scene, scale=2.0, energy=True), cloud(scene, batch=2)
+    after = emulator(state).state_after(state)
+    assert torch.equal(emulator.budget(after), emulator.budget(state))
+    assert torch.equal(emulator.budget(after.scenes([1])), emulator.budget(state)[1:])
+    assert torch.equal(emulator.budget(Particles.stack([after, after])), emulator.budget(state).repeat(2))
+    for changed in (after.with_motion(after.position, 3 * after.velocity), dataclasses.replace(after, mask=after.mask)):
+        assert changed.budget is None
+        assert not torch.equal(emulator.budget(changed), emulator.budget(state))
 
 
 @pytest.mark.parametrize("branching", [True, False])

@@ -199,6 +199,37 @@ def test_a_field_that_is_not_finite_spreads_as_far():
     torch.testing.assert_close(fused, tensors, rtol=1e-3, atol=LIMIT, equal_nan=True)
 
 
+FILLERS = [float("nan"), float("inf"), -float("inf"), 3e38, -1e30, 0.0, 0.5]
+CONSTRAINED = [{}, HELD, {**HELD, "density_cap": 1.0}, {"bounds": "reflect", "energy": True}]
+
+
+@pytest.mark.parametrize("constraints", CONSTRAINED, ids=str)
+@pytest.mark.parametrize("kernels", [True, False], ids=["kernels", "tensors"])
+@given(filler=st.sampled_from(FILLERS), number=st.integers(-9, 9), of=st.sampled_from(["position", "velocity", "all"]))
+@settings(max_examples=8, deadline=None)
+def test_a_rollout_is_the_same_to_the_bit_whatever_padding_holds(kernels, constraints, filler, number, of):
+    scene, particles = with_extras(box(obstacles=True), cloud(box(), 60, batch=2, statics=9), True, True, True)
+    emulator = emulator_of(scene, cells=12, scale=2.0, **constraints)
+    particles = dataclasses.replace(particles, mask=torch.arange(60).expand(2, 60) < torch.tensor([[60], [47]]))
+    particles = dataclasses.replace(particles, obstacle_mask=torch.arange(9).expand(2, 9) < torch.tensor([[4], [9]]))
+    real, solid = particles.mask, particles.obstacle_mask
+    changed = {of: getattr(particles, of).masked_fill(~real.unsqueeze(-1), filler)} if of != "all" else {
+        name: getattr(particles, name).masked_fill(~there, filler)
+        for name, there in {
+            "position": real.unsqueeze(-1), "velocity": real.unsqueeze(-1), "volume": real,
+            "obstacle": solid.unsqueeze(-1), "obstacle_velocity": solid.unsqueeze(-1),
+        }.items()
+    } | {"material": particles.material.masked_fill(~real, number)}  # fmt: skip
+    dirty = dataclasses.replace(particles, **changed)
+    filled = {n: v if v.shape[1] == 1 else v.masked_fill(~real, filler) for n, v in dirty.fields.items()}
+    dirty = dirty.with_fields(filled) if of == "all" else dirty
+    with nullcontext() if kernels else without_kernels():
+        one, other = (rollout(emulator, state, 2 * emulator.frames) for state in (particles, dirty))
+    there = real[:, None, :, None]
+    assert torch.equal(one.where(there, 0.0), other.where(there, 0.0))
+    assert other.isfinite().all()
+
+
 @pytest.mark.parametrize("transfer", [Nearest(), Linear(), Quadratic()])
 @pytest.mark.parametrize("kernels", [True, False], ids=["kernels", "tensors"])
 def test_padding_changes_nothing_to_the_bit_however_fast_and_wherever_it_is(kernels, transfer):
