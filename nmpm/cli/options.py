@@ -206,6 +206,9 @@ def add_data_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--boundary", metavar="KIND,...", help='"wall", "periodic" or "open" per axis, e.g. periodic,wall'
     )
+    group.add_argument(
+        "--axes", metavar="TND", help="positions are frames, particles, axes, though their first two look swapped"
+    )
     changes = parser.add_argument_group("changes of positions")
     changes.add_argument("--resample", type=float, metavar="DT", help="interpolate to frames that are DT apart in time")
     changes.add_argument(
@@ -240,6 +243,7 @@ def data_options(options: argparse.Namespace) -> Options:
         fields=parse_option("--fields", options.fields, _field_names, "names, e.g. temperature,stiffness"),
         resample=options.resample,
         smooth=options.smooth,
+        axes=options.axes,
         files=options.files,
     )
 

@@ -12,6 +12,7 @@ CORE = ("position", "particle_type")
 """Names of the arrays that every trajectory has; all others are fields."""
 
 _SWAPPED = 10.0
+_SWAP = "np.swapaxes(position, 0, 1)"
 _SAMPLE = 64  # frames and particles that are compared
 _USUAL = 0.25  # quantile of the sizes of frames: some may have overflowed, or collapsed
 _ABSURD = 1000.0  # times the usual size: no particle gets so far
@@ -109,26 +110,34 @@ def broken_frames(position: np.ndarray) -> np.ndarray:
 
 
 def check_axes(position: np.ndarray, particles: int | None, where: str) -> None:
-    """Refuses (N, T, D) positions where the number of particles does not tell the axes apart, or is not known (None).
-
-    Between frames a particle moves less than the distance to another particle, which may be anywhere; the limit is
-    `_SWAPPED` times that distance.
+    """Refuses (N, T, D) positions where the number of particles is known and tells the axes apart.
 
     Raises:
         DataError: naming `where`, and how to swap the axes.
     """
-    sizes = position.shape[:2]
-    if sizes[0] != sizes[1] and particles in sizes:
-        if particles == sizes[0]:
-            raise _swapped_error(position, f"there are {particles} particles", where)
-        return
+    if particles == position.shape[0] != position.shape[1]:
+        raise DataError(
+            f"{where}: the axes of positions {position.shape} look swapped: there are {particles} particles. Give (T,"
+            f" N, D), frames first: {_SWAP}."
+        )
+
+
+def swapped_axes(position: np.ndarray) -> str:
+    """Why positions look as (N, T, D) rather than (T, N, D), and the remedies; empty if they do not.
+
+    Between frames a particle moves less than the distance to another particle, which may be anywhere; the limit is
+    `_SWAPPED` times that distance. Particles on a lattice that are fast, or rarely recorded, look swapped, too.
+    """
     sample = position[:_SAMPLE, :_SAMPLE].astype(np.float64)
     if min(sample.shape[:2]) < 2:
-        return
+        return ""
     first, second = (_median_distance(sample, axis) for axis in (0, 1))
-    if first > _SWAPPED * second:
-        reason = f"neighbours along the first axis are {first:.3g} apart, along the second {second:.3g}"
-        raise _swapped_error(position, reason, where)
+    if not first > _SWAPPED * second > 0:
+        return ""
+    return (
+        f"the axes of positions look swapped: neighbours along the first of {position.shape} are {first:.3g} apart,"
+        f" along the second {second:.3g}. Give (T, N, D), frames first: {_SWAP}. Or state that they are so: --axes TND."
+    )
 
 
 def _median_distance(sample: np.ndarray, axis: int) -> float:
@@ -136,10 +145,3 @@ def _median_distance(sample: np.ndarray, axis: int) -> float:
     distances = np.linalg.norm(np.diff(sample, axis=axis), axis=-1)
     finite = distances[np.isfinite(distances)]
     return float(np.median(finite)) if finite.size else 0.0
-
-
-def _swapped_error(position: np.ndarray, reason: str, where: str) -> DataError:
-    return DataError(
-        f"{where}: the axes of positions {position.shape} look swapped: {reason}. Give (T, N, D), frames first:"
-        " np.swapaxes(position, 0, 1)."
-    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from nmpm.data.array_checks import check_axes, check_end
+from nmpm.data.array_checks import check_end, swapped_axes
 from nmpm.data.convert.base import make_options
 from nmpm.data.convert.conversion import write_native
 from nmpm.data.convert.runs_in_memory import Runs, open_runs
@@ -20,6 +21,8 @@ from nmpm.data.split_files import SPLITS
 from nmpm.data.statistics import first_outside
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
+
+_log = logging.getLogger(__name__)
 
 STATIC_NAME = "boundary"
 
@@ -50,7 +53,7 @@ def write_trajectories(
 
     Raises:
         ConfigError: if the file is not named after a split, or a fact is invalid.
-        DataError: if arrays do not fit together or the scene, their axes look swapped, existing metadata state another
+        DataError: if arrays do not fit together or the scene, existing metadata state another
             scene, or writing fails.
     """
     if scene is None:
@@ -89,7 +92,8 @@ def _check_trajectories(trajectories: Runs, scene: Scene, path: Path, lengths: l
             raise DataError(f"{where} is a dict: with a scene, give a Trajectory.")
         trajectory = item if isinstance(item, Trajectory) else _from_bare_array(item, kinds, where)
         position, types = trajectory.position, np.unique(trajectory.particle_type)
-        check_axes(position, position.shape[1] if isinstance(item, Trajectory) else None, where)
+        if not isinstance(item, Trajectory) and (swapped := swapped_axes(position)):
+            _log.warning("%s: %s", where, swapped)
         check_end(position, where)
         if position.shape[2] != scene.dim:
             raise DataError(f"{where} has {position.shape[2]} axes, the scene has {scene.dim}.")

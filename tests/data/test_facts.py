@@ -237,6 +237,41 @@ class TestVolume:
         assert "on a lattice would give" in fact.how
 
 
+G = np.array([0.0, -9.81])
+FORCES = {
+    "gravity": (lambda x, v: G + 0 * v, None, None),
+    "gravity, thrown up": (lambda x, v: G + 0 * v, (0.0, 2.0), None),
+    "gravity, from rest": (lambda x, v: G + 0 * v, (0.0, 0.0), None),
+    "drag": (lambda x, v: -1.5 * v, (3.0, 1.0), "opposite to their velocity, as friction and drag"),
+    "sliding": (lambda x, v: -3 * v / np.linalg.norm(v, axis=1, keepdims=True), (3.0, 1.0), "friction"),
+    "gravity and drag": (lambda x, v: G - 1.0 * v, (3.0, 1.0), "changes with their velocity, as drag"),
+    "a spring": (lambda x, v: -4 * (x - np.array([20.0, 5.0])), (0.0, 0.0), "changes with their place, as a spring"),
+}
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4])
+@pytest.mark.parametrize("force", FORCES)
+def test_what_speaks_against_gravity_is_said(rng, force, noise):
+    accelerate, thrown_with, against = FORCES[force]
+    finder, dt = FactFinder(2), 0.01
+    for _ in range(3):
+        x = block(rng)
+        v = rng.normal(scale=0.01, size=x.shape) + (rng.uniform(-3, 3, 2) if thrown_with is None else thrown_with)
+        path = [x]
+        for _ in range(59 * 10):
+            v = v + dt / 10 * accelerate(x, v)
+            x = x + dt / 10 * v
+            path.append(x)
+        run = np.stack(path[::10]) + noise * rng.normal(size=(60, *x.shape))
+        finder.add(Trajectory(run.astype(np.float32), np.zeros(144, int), {}, {"time": dt * np.arange(60)}))
+    gravity = finder.facts().gravity
+    assert gravity.sure == ("likely" if against else "measured")
+    if against:
+        assert against in gravity.how
+    else:
+        assert gravity.value == pytest.approx(G, rel=5e-3, abs=0.05)
+
+
 class TestTime:
     def test_median_of_recorded_steps_and_a_word_on_uneven_ones(self, rng):
         run = thrown(rng, (0.0, -2.0), frames=20)

@@ -26,6 +26,8 @@ UNKNOWN_LENGTH = 0
 ANY_NAME = ("*",)
 """Patterns of a reader that goes by the content of files."""
 
+AXES = "axes"
+"""Key of `metadata.json`: the order of the axes of positions, where a user states it."""
 _SETTLED = ("bounds", "dt", "gravity", "boundary")
 
 
@@ -45,6 +47,7 @@ class Options:
     dt: float | None = None  # time between stored frames, in seconds
     gravity: Sequence[float] | None = None  # acceleration in length/s² per axis
     boundary: Sequence[Boundary] | None = None  # "wall", "periodic" or "open" per axis
+    axes: str | None = None  # "TND" states that positions are frames, particles, axes, though they look swapped
     fields: Sequence[str] | None = None  # names of the fields that are inputs of models
     resample: float | None = None  # time between frames that positions are interpolated to
     smooth: int | None = None  # frames of the local quadratic fit that replaces positions
@@ -53,6 +56,8 @@ class Options:
     def __post_init__(self) -> None:
         if self.boundary is not None and not set(self.boundary) <= set(get_args(Boundary)):
             raise ConfigError(f"boundary = {list(self.boundary)} must be {', '.join(get_args(Boundary))} per axis.")
+        if self.axes not in (None, "TND"):
+            raise ConfigError(f"axes = {self.axes}: positions are read as TND: frames, particles, axes. Swap others.")
         check_field_names(self.fields or ())
         if self.resample is not None and not 0 < self.resample < math.inf:
             raise ConfigError(f"resample = {self.resample} must be positive: the time between the new frames.")
@@ -102,6 +107,7 @@ class Options:
             metadata = replace(metadata, prescribed_types=metadata.prescribed_types - self.static)
         changes: dict[str, Any] = {"static_types": self.static, "prescribed_types": self.prescribed}
         changes["dt"] = self.resample or self.dt
+        changes["extra"] = metadata.extra | {AXES: self.axes} if self.axes else None
         if self.bounds is not None:
             changes |= {"bounds": tuple((float(low), float(high)) for low, high in self.bounds)}
             metadata = replace(metadata, domain=None)

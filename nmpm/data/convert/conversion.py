@@ -13,8 +13,8 @@ import numpy as np
 
 from nmpm._support.atomic import new_folder
 from nmpm._support.progress import progress_bar
-from nmpm.data.array_checks import check_end
-from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset
+from nmpm.data.array_checks import check_end, swapped_axes
+from nmpm.data.convert.base import AXES, UNKNOWN_LENGTH, ForeignDataset
 from nmpm.data.facts import FOUND, FactFinder
 from nmpm.data.format import Metadata, Split, Trajectory, write_metadata, write_split
 from nmpm.data.split_files import SPLITS
@@ -110,6 +110,7 @@ class _Log:
         self.motion, self.statistics = MotionStatistics(self.metadata), dict[str, list[float]]()
         self.number = self.moving_boundaries = self.particles = 0
         self.frames: set[int] = set()
+        self.swapped = ""  # why axes look swapped
         self.extent = Extent(self.metadata.dim)
         dt = None if "dt" in self.unknown else self.metadata.dt
         boundary = None if "boundary" in self.unknown else self.metadata.boundary
@@ -142,6 +143,8 @@ class _Log:
             metadata.check_types(types, where)
         if not self.statistics:
             self.motion.add(trajectory)
+        if AXES not in metadata.extra and not np.ptp(types) and not self.swapped:
+            self.swapped = swapped_axes(position) and f"{where}: {swapped_axes(position)}"
         static, moving = metadata.is_static(types), metadata.is_moving(types)
         if moving.any():
             check_end(position[:, moving], where)
@@ -195,7 +198,7 @@ class _Log:
                 " positions are kept; to train on them, state which types are static (--static), and which move as"
                 " recorded (--prescribed)."
             )
-        notes += self._facts
+        notes += [self.swapped] * bool(self.swapped) + self._facts
         if self.metadata.sequence_length != UNKNOWN_LENGTH and "sequence_length" not in self.unknown:
             return replace(self.metadata, extra=extra), notes + notes_on_lengths(self.frames, self.metadata)
         return replace(self.metadata, extra=extra, sequence_length=max(self.frames) - 1), notes

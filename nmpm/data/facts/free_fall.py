@@ -27,6 +27,10 @@ _CLEAR = 0.5  # the same where they alone show gravity, or that it differs
 _MOST = 0.6  # of the trajectories must agree
 _MEAN_AGREE = 0.05  # of gravity
 _LATER, _LATER_FRAMES, _LATER_SHARE = 24, 5, 0.05  # parabolas over a whole trajectory, their frames, share that agrees
+_COMPARED_TRACKS, _LEAST_FITS = 4, 32  # of parabolas by which an acceleration is compared with velocities and places
+_SIMILAR = 0.3  # of gravity: accelerations that differ by less are compared
+_OPPOSITE, _NEARLY_ALL = 0.99, 0.95  # cosine, and share of the parabolas
+_CHANGES, _EXPLAINED = 0.02, 0.6  # of gravity, and of the variance: a dependence that is more than noise
 _EXACT = 0.01  # of gravity: smaller components are none
 _ROUNDED = 5e-4  # of gravity
 _BALANCED = 1e-3  # of single accelerations: a smaller mean is none, where only particles push each other
@@ -148,7 +152,7 @@ def find_gravity(tracks: Sequence[Track], spacing: float, dt: float, closed: boo
     if straight and 2 * len(straight) >= len(free):
         return _no_gravity(straight, number, spacing, dt)
     if alike := _agreeing([flight.acceleration for flight in free], _AGREE):
-        return _from_flights([free[index] for index in alike], number, dt)
+        return _from_flights([free[index] for index in alike], number, dt, _speaks_against(tracks, free))
     clear = [flight for flight in free if flight.share > _CLEAR]
     if len(clear) >= 2 and 2 * len(clear) >= number:
         return _differing(clear, number, dt)
@@ -205,7 +209,52 @@ def _agreeing(vectors: Sequence[np.ndarray], tolerance: float) -> list[int]:
     return np.flatnonzero(agree).tolist() if agree.mean() > _MOST else []
 
 
-def _from_flights(flights: Sequence[Flight], number: int, dt: float) -> Fact[Gravity | None]:
+def _speaks_against(tracks: Sequence[Track], flights: Sequence[Flight]) -> str:
+    """Why an acceleration that particles share may be no gravity, which is the same at all velocities, places, times.
+
+    Drag changes with the velocity, a spring or a field with the place, and friction is opposite to the velocity.
+    """
+    shared = np.median([flight.acceleration for flight in flights], axis=0)
+    size = float(np.linalg.norm(shared))
+    accelerations, velocities, places = [], [], []
+    for track in tracks[:_COMPARED_TRACKS]:
+        for start in range(0, min(2 * _LONG, len(track.position) - _FRAMES[0] + 1), _FRAMES[0]):
+            window = slice(start, start + _FRAMES[0])
+            path = track.position[window, : _CANDIDATES // 4]
+            there = np.isfinite(path).all(axis=(0, 2))
+            fitted = fit_parabolas(path, track.time[window])
+            free = np.linalg.norm(fitted.acceleration - shared, axis=1) < _SIMILAR * size
+            free &= fitted.error < _AGREE * size
+            accelerations.append(fitted.acceleration[free])
+            velocities.append(fitted.velocity[free])
+            places.append(path.mean(axis=0)[there][free])
+    acceleration, velocity, place = map(np.concatenate, (accelerations, velocities, places))
+    if len(acceleration) < _LEAST_FITS:
+        return ""
+    along = (velocity * acceleration).sum(axis=1)
+    speed = np.linalg.norm(velocity, axis=1)
+    braked = along < -_OPPOSITE * speed * np.linalg.norm(acceleration, axis=1)
+    if braked.mean() > _NEARLY_ALL:
+        return "it is opposite to their velocity, as friction and drag are"
+    explained = {
+        "their velocity, as drag does": _explained(acceleration, velocity, size),
+        "their place, as a spring or a field does": _explained(acceleration, place, size),
+    }
+    most = max(explained, key=lambda what: explained[what])
+    return f"it changes with {most}" if explained[most] > _EXPLAINED else ""
+
+
+def _explained(acceleration: np.ndarray, cause: np.ndarray, size: float) -> float:
+    """The part of the variance of (n, D) accelerations that a linear function of a cause explains; 0 if it is small."""
+    change = acceleration - acceleration.mean(axis=0)
+    basis = cause - cause.mean(axis=0)
+    fitted = basis @ np.linalg.lstsq(basis, change, rcond=None)[0]
+    if math.sqrt(float((fitted**2).sum(axis=1).mean())) < _CHANGES * size:
+        return 0.0
+    return float((fitted**2).sum() / (change**2).sum())
+
+
+def _from_flights(flights: Sequence[Flight], number: int, dt: float, against: str) -> Fact[Gravity | None]:
     vectors = [flight.acceleration for flight in flights]
     share = float(np.median([flight.share for flight in flights]))
     means = sum(_same(flight.mean, flight.acceleration, _AGREE) for flight in flights)
@@ -213,6 +262,8 @@ def _from_flights(flights: Sequence[Flight], number: int, dt: float) -> Fact[Gra
         f"free flight of {share:.0%} of the particles in first frames of {len(flights)} of {number} trajectories, the"
         f" mean acceleration of all in {means}"
     )
+    if against:
+        return _gravity(vectors, dt, f"{how}, but {against}", "likely")
     clear = means or (share > _CLEAR and len(flights) > 1)
     return _gravity(vectors, dt, how if clear else f"{how}: others collide", "measured" if clear else "likely")
 

@@ -12,7 +12,13 @@ from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.inspection import comparisons
 from nmpm.data.inspection.findings import Finding, Severity
-from nmpm.data.inspection.irregular_motion import find_broken_frames, find_disorder, find_irregular_motion, find_noise
+from nmpm.data.inspection.irregular_motion import (
+    find_broken_frames,
+    find_disorder,
+    find_irregular_motion,
+    find_noise,
+    find_swapped_axes,
+)
 from nmpm.data.inspection.motion import Motion, spacing_of
 from nmpm.data.inspection.stated import check_stated, find_odd_particles, find_time_faults, free_fall
 from nmpm.data.statistics import Extent
@@ -51,7 +57,7 @@ class DatasetChecks:
         self._walls.add(trajectory.position[:, self.metadata.is_static(trajectory.particle_type)])
         if not motion.present.any():
             return
-        for find in (find_broken_frames, find_time_faults, find_disorder):
+        for find in (find_broken_frames, find_time_faults, find_swapped_axes, find_disorder):
             causes = list(find(motion))
             self._findings += causes
             if any(cause.severity == Severity.CONTRADICTION for cause in causes):

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from nmpm._support.messages import counted
-from nmpm.data.array_checks import broken_frames, frames_at_one_point, particles_far_away
+from nmpm.data.array_checks import broken_frames, frames_at_one_point, particles_far_away, swapped_axes
+from nmpm.data.convert.base import AXES
 from nmpm.data.inspection.findings import Finding, Severity
 from nmpm.data.inspection.motion import Motion, lengths
 from nmpm.data.statistics import relative_positions
@@ -70,6 +71,13 @@ def find_broken_frames(motion: Motion) -> Iterator[Finding]:
                 f"frame {frame}{f', particle {motion.index[index]}' if wrong is lost else ''}",
                 badness=float(wrong.mean()),
             )
+
+
+def find_swapped_axes(motion: Motion) -> Iterator[Finding]:
+    """Yields a finding if the axes of particles of one type look swapped and nobody states that they are not."""
+    alike = not np.ptp(motion.trajectory.particle_type) and AXES not in motion.metadata.extra
+    if alike and (reason := swapped_axes(motion.trajectory.position)):
+        yield Finding("axes", Severity.CONTRADICTION, reason, motion.where)
 
 
 def find_disorder(motion: Motion) -> Iterator[Finding]:

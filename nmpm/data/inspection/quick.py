@@ -43,6 +43,7 @@ def _stated_options(source: FolderSource) -> list[str]:
     options = source.options
     stated = {
         "family": options.family,
+        "axes": options.axes,
         "gravity": options.gravity and ",".join(f"{value:g}" for value in options.gravity),
         "boundary": options.boundary and ",".join(options.boundary),
         "bounds": options.bounds and ",".join(f"{low:g}:{high:g}" for low, high in options.bounds),

@@ -8,7 +8,9 @@ import pytest
 
 from nmpm.data.convert import Options, convert, open_dataset
 from nmpm.data.format import Split, read_metadata
-from nmpm.errors import DataError
+from nmpm.data.inspection import inspect
+from nmpm.data.loading.sources import FolderSource
+from nmpm.errors import ConfigError, DataError
 
 FRAMES, PARTICLES = 12, 5
 
@@ -198,9 +200,28 @@ def test_swapped_axes_are_refused_with_the_mend(tmp_path):
     np.savez(tmp_path / "swapped.npz", position=position, types=types)
     with pytest.raises(DataError, match=r"swapped.npz: the axes of positions \(20, 30, 2\) look swapped: there are 20"):
         read(tmp_path / "swapped.npz")
+
+
+def fast_lattice(frames: int = 12) -> np.ndarray:
+    """(T, N, 2) lattice whose particles come 20 spacings further in a frame: right, and as swapped as it looks."""
+    lattice = 0.01 * np.stack(np.meshgrid(*[np.arange(9.0)] * 2), -1).reshape(1, -1, 2)
+    return lattice + np.arange(frames)[:, None, None] * np.array([0.2, 0.1]) + np.arange(3.0).reshape(3, 1, 1, 1)
+
+
+@pytest.mark.parametrize("position", [fast_lattice(), made(frames=30, particles=20).swapaxes(0, 1)], ids=["no", "yes"])
+def test_axes_that_look_swapped_are_a_finding_that_an_option_overrules(tmp_path, position):
     np.save(tmp_path / "bare.npy", position)
-    with pytest.raises(DataError, match=r"bare.npy: .*look swapped: neighbours along the first axis.*swapaxes"):
-        read(tmp_path / "bare.npy")
+    notes = convert(tmp_path / "bare.npy", tmp_path / "native")
+    assert any("look swapped" in note for note in notes)
+    first = inspect(FolderSource(tmp_path / "native")).findings[0]
+    assert (first.kind, first.severity) == ("axes", "contradiction")
+    assert "np.swapaxes(position, 0, 1). Or state that they are so: --axes TND" in first.sentence
+    notes = convert(tmp_path / "bare.npy", tmp_path / "stated", options=Options(axes="TND"))
+    assert not any("look swapped" in note for note in notes)
+    for source in (FolderSource(tmp_path / "stated"), FolderSource(tmp_path / "native", Options(axes="TND"))):
+        assert "axes" not in {finding.kind for finding in inspect(source).findings}
+    with pytest.raises(ConfigError, match="axes = NTD: positions are read as TND"):
+        Options(axes="NTD")
 
 
 def test_objects_are_not_unpickled(tmp_path):
