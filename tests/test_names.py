@@ -27,7 +27,17 @@ SECTIONS = {
     "checkpoint": SAVER,
     "resume": SAVER,
 }
-LIGHTNING = {"config", "ckpt_path", "print_config", "help", "help_all", "version", "seed_everything", "verbose"}
+LIGHTNING = {
+    "config",
+    "ckpt_path",
+    "print_config",
+    "help",
+    "help_all",
+    "version",
+    "seed_everything",
+    "verbose",
+    "trust-config",
+}
 SIMULATE = {f"--{split}" for split in SPLITS}  # in a loop there
 OPTIONS = {f"--{name}" for name in (*LIGHTNING, *SECTIONS)} | SIMULATE | {
     word.value

@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,11 @@ from nmpm._support.bounded_files import check_yaml
 from nmpm._support.messages import one_line
 from nmpm._support.plain_data import load_plugins
 from nmpm.cli.console import quiet_lightning
+from nmpm.cli.early_checks import UsageError
 from nmpm.cli.emulator_cli import EmulatorCLI
 from nmpm.cli.match_options import MatchOptions
 from nmpm.cli.run_folder import CHECKPOINTS, CONFIG, SAVERS
+from nmpm.cli.trust import foreign_names, trust_advice
 from nmpm.errors import ConfigError
 
 PARSER_MODE = "omegaconf+"
@@ -50,8 +53,25 @@ def load_checked(text: str) -> Any:
     return value
 
 
-def run_command(words: list[str], note: str = "") -> int:
+def load_shared(text: str, trusted: frozenset[str]) -> Any:
+    """As `load_checked`, of a run that others may have written, whose files name known and trusted classes only.
+
+    Raises:
+        UsageError: for other names (a ValueError would have the parser take the text for another value).
+    """
+    content = load_checked(text)
+    for name in foreign_names(content, trusted) if isinstance(content, dict | list) else ():
+        raise UsageError(f"the run's configuration {trust_advice(name)}")
+    return content
+
+
+def run_command(words: list[str], note: str = "", trusted: frozenset[str] | None = None) -> int:
     """Run a training command, which prints the note when it starts; return the exit status.
+
+    Args:
+        words: Of the command line.
+        note: What to print.
+        trusted: Names in the user's own options, where others may have written the configuration.
 
     Raises:
         UsageError: for an option or key that cannot be.
@@ -60,7 +80,8 @@ def run_command(words: list[str], note: str = "") -> int:
     """
     load_plugins()
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)
-    set_loader(PARSER_MODE, load_checked, (YAMLError, ValueError, RecursionError))
+    load = load_checked if trusted is None else partial(load_shared, trusted=trusted)
+    set_loader(PARSER_MODE, load, (YAMLError, ValueError, RecursionError))
     # Not as `args`: Lightning starts further processes by the command line, and warns where the two differ.
     sys.argv = [sys.argv[0], *words]
     locks: list[int] = []

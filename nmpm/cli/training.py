@@ -32,6 +32,7 @@ from nmpm.cli.early_checks import (
 )
 from nmpm.cli.match_options import MatchOptions
 from nmpm.cli.run_folder import CONFIG, RunFolder
+from nmpm.cli.trust import NAME, OPTION, foreign_names, trust_advice
 from nmpm.errors import ConfigError
 
 FINE_TUNING = PACKAGE / "cli" / "fine_tune.yaml"
@@ -50,16 +51,34 @@ def run(words: list[str]) -> int:
         return 0
     try:
         options = read_options([_REPLACED.get(word, word) for word in words[1:]])
-        options, note = expand_run(command, options)
+        trusts = Option(OPTION) in options
+        own = [option for option in options if option.name != OPTION]
+        options, note = expand_run(command, own)
+        if not trusts:
+            check_trust(own, options)
         check_options(options)
         check_match_options(command, options)
         options = add_configuration(options) if command == "fit" else options
         from nmpm.cli.run_training import run_command
 
-        return run_command([command, *map(str, options)], note)
+        return run_command([command, *map(str, options)], note, None if trusts or own == options else names_in(own))
     except UsageError as error:
         sys.stderr.write(f"nmpm {command}: {error}\n")
         return 2
+
+
+def names_in(options: Sequence[Option]) -> frozenset[str]:
+    """Dotted names in options and in the configurations that they name, which are the user's own."""
+    configs = [Path(value).read_text(encoding="utf-8") for name, value in options if name == "--config" and value]
+    return frozenset(NAME.findall("\n".join([*map(str, options), *configs])))
+
+
+def check_trust(own: Sequence[Option], options: Sequence[Option]) -> None:
+    """Raise ConfigError if the configuration of a run, which options have beside the user's own, names foreign code."""
+    for name, value in options:
+        if name == "--config" and value and Option(name, value) not in own:
+            for foreign in foreign_names(read_config(Path(value)), names_in(own)):
+                raise ConfigError(f"{value} {trust_advice(foreign)}")
 
 
 def check_match_options(command: str, options: Sequence[Option]) -> None:
@@ -252,6 +271,7 @@ OPTIONS = {
     "--stride K": "likewise: frames of the data for one of the model, such as 2 or 1/4 (default: what matches best)",
     "--strict": "likewise: refuse data whose gravity, frames, particles, speeds or walls are not the model's",
     "--members N": "test only: score so many rollouts of each scene as an ensemble, too",
+    "--trust-config": "run what the configuration of RUN names although nmpm did not write it",
     "--seed_everything N": "seed of all random numbers (default: 0)",
     "--print_config": "print the configuration that results, and stop",
 }
