@@ -10,6 +10,7 @@ import zipfile
 import h5py
 import numpy as np
 import pytest
+import scipy.io
 
 from nmpm.data.convert import Options, open_dataset
 from nmpm.data.format import Split, read_metadata, write_metadata
@@ -68,6 +69,8 @@ NATIVE = hdf5(
      (("position", POSITION), ("particle_type", TYPES), ("heat", np.ones((6, 5))))}
 )  # fmt: skip
 NEURALMPM = hdf5({"particles": POSITION, "boundary": POSITION[:, :3], "types": TYPES, "grav": np.array([0.0, -9.81])})
+MATLAB = io.BytesIO()
+scipy.io.savemat(MATLAB, {"run": {"position": POSITION, "types": TYPES}, "dt": 0.0025}, do_compression=True)
 RECORD = records.trajectory_record(POSITION, TYPES, step_context=np.ones((6, 3)))
 MESSAGES = dmcf.msgpack.packb(dmcf.frames())
 FORMATS = {
@@ -78,6 +81,7 @@ FORMATS = {
     "gns-npz": ("train.npz", zipped(npy()), bytes),
     "gns-npz inside": ("train.npz", npy(), zipped),
     "neuralmpm": ("train/sim_0.h5", NEURALMPM, bytes),
+    "mat": ("train/a.mat", MATLAB.getvalue(), bytes),
     "dmcf": ("train/a.msgpack.zst", compressed(MESSAGES), bytes),
     "dmcf inside": ("train/a.msgpack.zst", MESSAGES, compressed),
     "rollout-pickle": ("rollout_0.pkl", pickled(4), bytes),

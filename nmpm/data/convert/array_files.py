@@ -1,4 +1,4 @@
-"""NumPy and HDF5 files of arrays under usual names: `.npz`, `.npy`, `.h5`, `.hdf5`, and folders of them.
+"""Files of arrays under usual names: NumPy's `.npz` and `.npy`, HDF5, MATLAB's `.mat`, and folders of them.
 
 A file holds one run, or several: stacked, numbered, or in groups (`nmpm.data.convert.run_arrays`). A folder of `.npy`
 files of which one is called positions, and the others types, velocities and the like, is one run. Objects are not
@@ -21,6 +21,7 @@ import numpy as np
 from nmpm._support.bounded_files import EXPANSION, NPZ_ERRORS, check_regular, expansion_limit
 from nmpm._support.messages import one_line
 from nmpm.data.convert.base import readable, split_files
+from nmpm.data.convert.mat import open_mat
 from nmpm.data.convert.named_arrays import USUAL_NAMES, ArrayLike, Arrays, describe, plain_name
 from nmpm.data.convert.run_arrays import group_runs
 from nmpm.data.convert.run_files import Facts, Run, RunFiles
@@ -34,8 +35,8 @@ class ArrayFiles(RunFiles):
     """Files of arrays: positions (T, N, D) or (R, T, N, D), and whatever fits them."""
 
     name: ClassVar[str] = "arrays"
-    summary: ClassVar[str] = "positions (T, N, D) or (R, T, N, D) in .npz, .npy, .h5, .hdf5, by usual names"
-    patterns: tuple[str, ...] = ("*.npz", "*.npy", "*.h5", "*.hdf5")
+    summary: ClassVar[str] = "positions (T, N, D) or (R, T, N, D) in .npz, .npy, .h5, .hdf5, .mat, by usual names"
+    patterns: tuple[str, ...] = ("*.npz", "*.npy", "*.h5", "*.hdf5", "*.mat")
 
     def recognises(self, path: Path) -> bool:
         first = next(iter(self.files(path).values()), ())
@@ -90,6 +91,9 @@ def open_arrays(path: Path) -> Iterator[Arrays]:
         yield {file.stem: _open_npy(file) for file in _npy_files(path)}
     elif path.suffix == ".npy":
         yield {"position": _open_npy(path)}
+    elif path.suffix == ".mat":
+        with open_mat(path) as arrays:
+            yield arrays
     elif path.suffix == ".npz":
         members = npz_members(path)
         with zipfile.ZipFile(path) as archive:

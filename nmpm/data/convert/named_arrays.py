@@ -69,6 +69,9 @@ COMPONENTS: Mapping[str, tuple[Sequence[str], ...]] = {
 """Names of arrays that hold one axis each."""
 
 
+_SAMPLE = 64  # entries along each axis that are compared
+
+
 class ArrayLike(Protocol):
     """An array that is read when it is indexed: NumPy's, or a dataset in a file."""
 
@@ -228,6 +231,30 @@ def can_be_positions(array: ArrayLike) -> bool:
     """Whether an array is (T, N, D) or (R, T, N, D) numbers with D = 1 to 3."""
     shape = array.shape
     return array.dtype.kind in "fiu" and len(shape) in (3, 4) and 1 <= shape[-1] <= 3 and 0 not in shape
+
+
+def transposition(array: ArrayLike) -> tuple[tuple[int, ...], str] | None:
+    """The axes of an array in the order of positions, and what they are in theirs; None if it cannot be positions.
+
+    The axes of space are the last axis of 2 or 3 entries. Along time neighbours differ least; there are fewer runs than
+    particles. Where none differ least, the order of the other axes is kept.
+    """
+    shape, numbers = tuple(array.shape), array.dtype.kind in "fiu"
+    small = [axis for axis, size in enumerate(shape) if size in (2, 3)]
+    if not numbers or len(shape) not in (3, 4) or not small or min(shape) < 1:
+        return None
+    rows = np.stack([np.asarray(array[row]) for row in range(min(shape[0], _SAMPLE))]).astype(np.float64)
+    sample = rows[tuple(slice(_SAMPLE) for _ in shape)]
+    others = [axis for axis in range(len(shape)) if axis != small[-1]]
+    changes = [np.abs(np.diff(sample, axis=axis)) for axis in others]
+    steps = [float(change[np.isfinite(change)].mean()) if np.isfinite(change).any() else np.inf for change in changes]
+    order = (*others, small[-1])
+    if 2 * min(steps) < sorted(steps)[1]:
+        time = others[int(np.argmin(steps))]
+        rest = sorted((axis for axis in others if axis != time), key=lambda axis: shape[axis])
+        order = (*rest[:-1], time, rest[-1], small[-1])
+    letters = dict(zip(order, "RTND"[-len(shape) :], strict=True))
+    return order, ", ".join(letters[axis] for axis in range(len(shape)))
 
 
 def position_name(arrays: Arrays) -> str | None:

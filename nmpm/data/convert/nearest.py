@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from nmpm.data.convert.array_files import ArrayFiles, open_arrays
-from nmpm.data.convert.named_arrays import Arrays, can_be_positions, describe, with_meaning
+from nmpm.data.convert.named_arrays import Arrays, can_be_positions, describe, transposition, with_meaning
 from nmpm.data.convert.tables import SUFFIXES
 from nmpm.data.convert.tracks import table_columns
 from nmpm.data.split_files import SPLITS, is_no_data
@@ -26,7 +26,6 @@ _WRITE = 'nmpm.write_trajectories("mydata", runs, dt=…)'
 HINTS: Mapping[str, str] = {
     suffix: hint
     for suffixes, hint in (
-        (".mat", f"read it by scipy.io.loadmat (or h5py) and write positions (T, N, D) by {_WRITE}"),
         (".pt .pth", f"read it by torch.load(…, weights_only=True) and write positions (T, N, D) by {_WRITE}"),
         (
             ".pkl .pickle",
@@ -178,12 +177,12 @@ def _array_problem(file: Path) -> str:
             candidates = {name: array for name, array in arrays.items() if can_be_positions(array)}
             if len(candidates) > 1:
                 return f"which array are the positions? Call it position ({describe(candidates)})."
-            return _wrong_positions(arrays) or f"no array can be positions ({describe(arrays)}); {wanted}."
+            return _wrong_positions(arrays, file.suffix) or f"no array can be positions ({describe(arrays)}); {wanted}."
     except NmpmError as error:
         return str(error).removeprefix(f"{file}: ")
 
 
-def _wrong_positions(arrays: Arrays) -> str | None:
+def _wrong_positions(arrays: Arrays, suffix: str) -> str | None:
     """What is wrong with the shape of the array that is called positions, or else of the largest one."""
     if {"particles", "solver_data"} <= set(arrays):
         return f"PySPH's .npz holds Python objects, which are not unpickled. {_PYSPH}"
@@ -194,13 +193,18 @@ def _wrong_positions(arrays: Arrays) -> str | None:
     for name in (named or largest)[:1]:
         kind, shape = arrays[name].dtype, tuple(arrays[name].shape)
         problem = f"{name!r} is {kind} of shape {shape}; positions are (T, N, D), or (R, T, N, D) of R runs"
-        small = [axis for axis, size in enumerate(shape) if size in (2, 3)]
         if kind.hasobject:
             return (
                 f"{name!r} holds Python objects, which are not unpickled: save each run as run0, run1, … by np.savez."
             )
-        if len(shape) in (3, 4) and small:
-            return f"{problem}, the axes of space last: np.moveaxis({name.split('/')[-1]}, {small[-1]}, -1)."
+        if kind.kind in "SU":
+            return f"{name!r} holds texts; save numbers: .astype(float)."
+        if (found := transposition(arrays[name])) is not None:
+            order, axes = found
+            leaf = name.split("/")[-1]
+            matlab = f"in MATLAB permute({leaf}, {[axis + 1 for axis in order]}), or "
+            way = f"{matlab if suffix == '.mat' else ''}np.transpose({leaf}, {order}) and {_WRITE}"
+            return f"{problem}; its axes look like ({axes}): {way}."
         if len(shape) == 2 and shape[1] in (2, 3):
             return f"{problem}: this is one frame. Give the folder of the frames, or stack them: np.stack(frames)."
         return f"{problem}: frames, particles, 1 to 3 axes."

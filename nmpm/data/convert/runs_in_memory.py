@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from nmpm.data.convert.base import ForeignDataset, Options
+from nmpm.data.convert.named_arrays import transposition
 from nmpm.data.convert.run_arrays import RunArrays, group_runs
 from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Facts, Run, open_divided, placeholder_metadata
 from nmpm.data.format import Metadata, Trajectory
@@ -71,6 +72,8 @@ def _each(runs: Runs | Mapping[str, Any], where: str) -> Iterator[_MemoryRun]:
         groups = list(group_runs(arrays, name))
         if not groups:
             shapes = ", ".join(f"{key} {array.shape}" for key, array in arrays.items())
-            raise DataError(f"{name}: none of the arrays is (T, N, D) or (R, T, N, D) positions ({shapes}).")
+            found = transposition(max(arrays.values(), key=np.size))
+            mend = "" if found is None else f" Its axes look like ({found[1]}): np.transpose(…, {found[0]})."
+            raise DataError(f"{name}: none of the arrays is (T, N, D) or (R, T, N, D) positions ({shapes}).{mend}")
         for group in groups:
             yield from (_MemoryRun(Path(name), index, group.frames, source=group) for index in range(group.count))

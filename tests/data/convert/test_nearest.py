@@ -1,11 +1,14 @@
 """What is said of data of no known form."""
 
+import re
 import shutil
 
 import h5py
 import numpy as np
 import pytest
+import scipy.io
 
+import nmpm
 from nmpm.data.convert import native_folder, open_dataset
 from nmpm.data.convert.nearest import HINTS
 from nmpm.errors import DataError
@@ -23,7 +26,10 @@ def refuse(path, message):
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"pos": np.moveaxis(RUN, -1, 2)}, r"'pos' is float32 of shape \(3, 30, 2, 20\).*np\.moveaxis\(pos, 2, -1\)"),
+        (
+            {"pos": np.moveaxis(RUN, -1, 2)},
+            r"'pos' is float32 of shape \(3, 30, 2, 20\).*\(R, T, D, N\): np\.transpose\(pos, \(0, 1, 3, 2\)\)",
+        ),
         ({"positions": RUN[0, 0]}, r"'positions' is .*this is one frame.*np\.stack\(frames\)"),
         ({"a": RUN, "b": RUN}, r"which array are the positions\? Call it position \(a float32 .*, b float32"),
         ({"state": np.zeros((30, 20, 6))}, r"'state' is float64 of shape \(30, 20, 6\); positions are"),
@@ -97,3 +103,39 @@ def test_folders_with_splits_of_their_own_are_not_runs_of_one_dataset(tmp_path):
     assert set(open_dataset(tmp_path / "sand").splits) == {"train", "test"}
     with pytest.raises(DataError, match="holds several datasets, sand, water: "):
         open_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("axes", ["DNT", "NDT", "TDN", "TND", "DNTR", "NDTR", "RTDN"])
+@pytest.mark.parametrize("kind", ["npz", "h5", "mat", "memory"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_axes_in_another_order_come_with_their_transposition(tmp_path, axes, kind, dim):
+    """MATLAB's order among them; whether particles start at random or on a lattice."""
+    rng = np.random.default_rng(0)
+    lattice = np.stack(np.meshgrid(*[np.arange(4.0)] * dim, indexing="ij"), -1).reshape(-1, dim)
+    start = np.stack([lattice, rng.uniform(0, 4, lattice.shape), lattice + 0.5, lattice])
+    runs = start[:, None] + np.cumsum(rng.normal(0, 0.01, (4, 30, len(lattice), dim)), axis=1)
+    right = runs if "R" in axes else runs[0]
+    names = "RTND" if "R" in axes else "TND"
+    stored = np.transpose(right, [names.index(axis) for axis in axes])
+    if kind == "memory":
+        if axes == "TND":
+            return
+        with pytest.raises(DataError) as caught:
+            nmpm.write_trajectories(tmp_path / "out", [stored], dt=1.0)
+    else:
+        path = tmp_path / f"a.{kind}"
+        if kind == "npz":
+            np.savez(path, pos=stored)
+        elif kind == "mat":
+            scipy.io.savemat(path, {"pos": stored})
+        else:
+            with h5py.File(path, "w") as file:
+                file["pos"] = stored
+        if axes == "TND":
+            np.testing.assert_allclose(next(open_dataset(path).splits["train"]()).position, right, rtol=1e-6)
+            return
+        with pytest.raises(DataError) as caught:
+            open_dataset(path)
+        assert kind != "mat" or re.search(r"permute\(pos, \[[\d, ]+\]\)", str(caught.value))
+    order = re.search(r"np\.transpose\((?:pos|…), \(([\d, ]+)\)\)", str(caught.value))[1]
+    np.testing.assert_array_equal(np.transpose(stored, [int(axis) for axis in order.split(", ")]), right)
