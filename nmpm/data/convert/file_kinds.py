@@ -72,17 +72,23 @@ def choose_particles(folder: Path, kinds: Kinds, problem: Callable[[Path], str])
 
 
 def keep_particles(folder: Path, kinds: Kinds) -> tuple[Kinds, str]:
-    """The files of runs without those that are named as walls, surfaces and the like, and a note on these."""
-    particles = {kind: files for kind, files in kinds.items() if not words(kind) & (_WALL_WORDS | _OTHER_WORDS)}
+    """The lists of frames but for those that are called as walls, surfaces and the like are, and a note on these."""
+    particles = {kind: files for kind, files in kinds.items() if not _only_others(kind)}
     others = ", ".join(kind for kind in kinds if kind not in particles)
     if not particles or not others:
         return kinds, ""
     return particles, f"{folder}: left out by their names: {others}; --files PATTERN reads them."
 
 
-def is_other_folder(folder: Path) -> bool:
-    """Whether a folder is called as those of grids, surfaces and the like are."""
-    return bool(words(folder.name)) and words(folder.name) <= _OTHER_WORDS | _WALL_WORDS | {"bodies"}
+def other_folders(path: Path, folders: Mapping[Path, Sequence[Path]]) -> list[Path]:
+    """Folders that are called as those of grids and surfaces are, with files whose names no other folder has."""
+    others = [folder for folder in folders if folder != path and _only_others(folder.name)]
+    kinds = {kind for folder, files in folders.items() if folder not in others for kind in by_kind(files)}
+    return [folder for folder in others if kinds and not kinds & by_kind(folders[folder]).keys()]
+
+
+def _only_others(name: str) -> bool:
+    return bool(words(name)) and words(name) <= _OTHER_WORDS | _WALL_WORDS | {"bodies"}
 
 
 def is_other_name(name: str) -> bool:

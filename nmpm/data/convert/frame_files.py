@@ -41,9 +41,9 @@ from nmpm.data.convert.file_kinds import (
     Kinds,
     by_kind,
     choose_particles,
-    is_other_folder,
     keep_particles,
     material_names,
+    other_folders,
     stem,
 )
 from nmpm.data.convert.frame import Frame, Layout, ParticleArrays, flat_axes, join_frames
@@ -144,10 +144,9 @@ class FrameFormat(DatasetFormat):
         folders = list(self._folders(path))
         if not folders:
             raise DataError(f"{path}: no file {' or '.join(self.selected or self.patterns)} there.")
-        others = [folder for folder, _ in folders if folder != path and is_other_folder(folder)]
-        if others and len(others) < len(folders) and not self.selected:
-            folders = [(folder, files) for folder, files in folders if folder not in others]
-        many = len(list(islice(self.frames(folders[0][1][0]), 2))) > 1
+        others = [] if self.selected else other_folders(path, dict(folders))
+        folders = [(folder, files) for folder, files in folders if folder not in others]
+        many = self._has_many(folders[0][1])
         if path.is_file() and not many:
             raise DataError(f"{path}: there is one frame in it. Give the folder of the frames.")
         runs: list[FrameRun] = []
@@ -170,12 +169,21 @@ class FrameFormat(DatasetFormat):
         )
         return runs, [*filter(None, (_first_of(gaps), _first_of(choices), left_out))]
 
+    def _has_many(self, files: Sequence[Path]) -> bool:
+        """Whether the files have many frames each, as the first one with particles tells."""
+        firsts = [kind[0] for kind in by_kind(files).values()]
+        readable = firsts[:1] if len(firsts) == 1 else [file for file in firsts if not self._problem(file)]
+        return any(len(list(islice(self.frames(file), 2))) > 1 for file in readable[:1])
+
     def _choose(self, folder: Path, files: Sequence[Path], many: bool) -> tuple[Kinds, str]:
         """The files of particles among those of a folder, by their names, and a note on the others."""
         kinds = by_kind(files)
         if len(kinds) == 1 or self.selected:
             return kinds, ""
-        return keep_particles(folder, kinds) if many else choose_particles(folder, kinds, self._problem)
+        if not many:
+            return choose_particles(folder, kinds, self._problem)
+        lists = any(fnmatch.fnmatch(files[0].name, pattern) for pattern in self.listings)
+        return keep_particles(folder, kinds) if lists else (kinds, "")
 
     def _problem(self, file: Path) -> str:
         """Why a file has no particles; empty if it has."""

@@ -109,7 +109,9 @@ class FolderSource(DataSource):
 
     @cached_property
     def folder(self) -> Path:
-        if not self.path.exists() or (is_native(self.path) and not self.options.changes_positions):
+        if not self.path.exists() or (
+            is_native(self.path) and not self.options.changes_positions and self.options.files is None
+        ):
             return self.path
         return native_folder(self.path, self.options)
 

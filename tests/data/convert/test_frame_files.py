@@ -292,13 +292,14 @@ def test_wrong_files_are_named(tmp_path, damage, message):
         ),
         (["initial.xyz"], r"left out: initial.xyz \(another kind of file\); others are read by --files"),
         (["log_0.xyz"], r"left out: log_\*.xyz \(cannot be read as XYZ"),
+        (["a_log_0.xyz"], r"left out: a_log_\*.xyz \(cannot be read as XYZ"),
     ],
-    ids=["name", "one", "content"],
+    ids=["name", "one", "content", "first"],
 )
 def test_files_of_another_kind_beside_the_particles_are_left_out(tmp_path, others, note):
     position = write_run(tmp_path / "run")
     for name in others:
-        (tmp_path / "run" / name).write_text("no" if name.startswith("log") else frame_text(positions(particles=2)[0]))
+        (tmp_path / "run" / name).write_text("no" if "log" in name else frame_text(positions(particles=2)[0]))
     dataset = open_dataset(tmp_path / "run")
     assert any(re.search(note, line) for line in dataset.notes)
     np.testing.assert_array_equal(next(dataset.splits["train"]()).position, position.astype("f4"))
@@ -343,14 +344,12 @@ def test_files_that_are_selected_are_read_and_join_as_materials(tmp_path):
         open_dataset(tmp_path / "data", options=Options(files="snow_*"))
 
 
-def test_lists_and_folders_of_walls_are_left_out(tmp_path):
-    for name in ("grains", "walls"):
-        write_frames(tmp_path / "data" / f"{name}.xyz", *map(frame_text, positions(seed=len(name))))
-    dataset = open_dataset(tmp_path / "data")
-    assert dataset.counts == {"train": 1}
-    assert any("left out by their names: walls.xyz; --files PATTERN reads them" in note for note in dataset.notes)
+def test_folders_of_grids_are_left_out_where_their_files_are_others(tmp_path):
     write_run(tmp_path / "out" / "particles")
     write_run(tmp_path / "out" / "grids", 1)
+    assert open_dataset(tmp_path / "out").counts == {"train": 2}
+    for file in (tmp_path / "out" / "grids").iterdir():
+        file.rename(file.with_stem(file.stem.replace("frame", "grid")))
     dataset = open_dataset(tmp_path / "out")
     assert dataset.counts == {"train": 1}
     assert any("grids: left out by its name" in note for note in dataset.notes)
