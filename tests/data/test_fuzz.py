@@ -73,6 +73,17 @@ MATLAB = io.BytesIO()
 scipy.io.savemat(MATLAB, {"run": {"position": POSITION, "types": TYPES}, "dt": 0.0025}, do_compression=True)
 RECORD = records.trajectory_record(POSITION, TYPES, step_context=np.ones((6, 3)))
 MESSAGES = dmcf.msgpack.packb(dmcf.frames())
+FRAMES = hdf5({f"frame_{t}/{key}": POSITION[t] for t in range(6) for key in ("position", "velocity")})
+ROWS = {"position": POSITION, "species": np.tile(TYPES, (6, 1))}
+STEPS = {"step": np.arange(6), "time": np.arange(6) * 0.5}
+H5MD = hdf5(
+    {f"particles/all/{name}/{key}": values for name, rows in ROWS.items()
+     for key, values in ({"value": rows} | STEPS).items()}
+)  # fmt: skip
+TECPLOT = 'VARIABLES = "x", "y", "id"\n' + "".join(
+    f"ZONE SOLUTIONTIME={t}\n" + "".join(f"{x} {y} {i}\n" for i, (x, y) in enumerate(POSITION[t].tolist()))
+    for t in range(6)
+)
 FORMATS = {
     "native": ("train.h5", NATIVE, bytes),
     "metadata": ("metadata.json", json.dumps(METADATA).encode(), bytes),
@@ -86,6 +97,9 @@ FORMATS = {
     "dmcf inside": ("train/a.msgpack.zst", MESSAGES, compressed),
     "rollout-pickle": ("rollout_0.pkl", pickled(4), bytes),
     "rollout-pickle 2": ("rollout_0.pkl", pickled(2), bytes),
+    "array-frames": ("run.h5", FRAMES, bytes),
+    "h5md": ("run.h5", H5MD, bytes),
+    "tecplot": ("run.dat", TECPLOT.encode(), bytes),
 }
 """The file, its valid content or what is inside of it, and what puts that into compression and checksums."""
 

@@ -43,7 +43,7 @@ class Gsd(FrameFormat):
     def frames(self, file: Path) -> Iterator[Frame]:
         with _open(file) as content:
             for index in range(content.nframes):
-                with readable(file, "GSD", RuntimeError, LookupError):
+                with readable(file, "GSD", RuntimeError, LookupError, TypeError):
                     frame = _frame(content, index, f"{file}, frame {index}")
                 yield frame
 
@@ -59,7 +59,7 @@ def _open(file: Path) -> Iterator[Any]:
         import gsd.fl
     except ImportError as error:
         raise ConfigError(f"{file}: reading GSD needs gsd: {install('gsd')}.") from error
-    with readable(file, "GSD", RuntimeError, LookupError):
+    with readable(file, "GSD", RuntimeError, LookupError, TypeError):
         content = gsd.fl.open(str(file), "r", schema="hoomd")
     with content:
         yield content

@@ -15,7 +15,7 @@ import numpy as np
 from nmpm._support.messages import one_line
 from nmpm.data.convert.frame import ARRAY_NAMES, Frame
 from nmpm.data.convert.frame_files import FrameFormat
-from nmpm.data.convert.tables import plain_column
+from nmpm.data.convert.tables import as_numbers, plain_column
 from nmpm.data.convert.text_lines import Lines, is_number, open_lines, parse_columns, starts_with
 from nmpm.data.convert.tracks import coordinate_columns
 from nmpm.errors import DataError
@@ -78,6 +78,8 @@ def _frame(names: list[str], time: float | None, rows: bytes, where: str) -> Fra
         columns = parse_columns(rows, names)
     except ValueError as error:
         raise DataError(f"{where}: {one_line(error)}.") from error
-    position = np.stack([columns.pop(name) for name in coordinates], axis=1)
+    position = np.stack(
+        [as_numbers(columns.pop(name), f"{where}: the variable {name}") for name in coordinates], axis=1
+    )
     arrays = {plain_column(n) if plain_column(n) in ARRAY_NAMES else n: values for n, values in columns.items()}
     return Frame(position, arrays, time)
