@@ -137,9 +137,14 @@ def _stack_bases(states: Sequence[dict[str, Any]], shape: torch.Size) -> list[Te
     axes = [torch.stack(axis) if len(axis[0]) else None for axis in zip(*(state["Q"] for state in states), strict=True)]
     kernel = None
     for basis, length in zip(axes[2:], shape[2:], strict=True):
+        if length == 1:  # a sign, which cancels
+            continue
         if basis is None:
             basis = torch.eye(length, device=states[0]["exp_avg"].device).expand(len(states), -1, -1)
-        kernel = basis if kernel is None else torch.einsum("nij,nkl->nikjl", kernel, basis).flatten(3).flatten(1, 2)
+        if kernel is not None:
+            both = kernel[:, :, None, :, None] * basis[:, None, :, None]
+            basis = both.flatten(3).flatten(1, 2)
+        kernel = basis
     outputs, inputs = (*axes, None, None)[:2]
     return [outputs, inputs, kernel]
 

@@ -11,13 +11,15 @@ results.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import copy
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+from torch.nn.modules.conv import _ConvNd
 
 from nmpm._support.threads import map_ranges
 from nmpm.emulator import Bundle, Emulator, Prescribed, Rollout, RolloutContext
@@ -124,12 +126,58 @@ def on_threads(function: Callable[[slice], T], rows: Sequence[slice], threads: i
         torch.set_num_threads(inner)
 
 
+class CastNetworks:
+    """Copies of a network, one for each part, with convolutions' weights in the type that autocast computes in.
+
+    Autocast would cast each weight in each bundle, and its gradient back. Parts share no copy: which thread is first
+    would decide in which order gradients are added.
+    """
+
+    def __init__(self) -> None:
+        self._source: nn.Module | None = None
+        self._copies: list[nn.Module] = []
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> CastNetworks:
+        return CastNetworks()
+
+    def prepare(self, emulator: Emulator, count: int) -> Callable[[int], Emulator]:
+        """A function that gives each of `count` parts its emulator, with the weights of now."""
+        network, precision = emulator.processor, torch.get_autocast_dtype("cpu")
+        if not torch.is_autocast_enabled("cpu"):
+            return lambda _: emulator
+        if self._source is not network or len(self._copies) != count:
+            self._source, self._copies = network, [_cast(network, precision) for _ in range(count)]
+        return lambda part: _with_network(emulator, self._copies[part])
+
+
+def _cast(network: nn.Module, precision: torch.dtype) -> nn.Module:
+    """A copy with the weights of convolutions and linear layers in a precision."""
+    cast = copy.deepcopy(network)
+    for layer in cast.modules():
+        if isinstance(layer, (_ConvNd, nn.Linear)):
+            layer.to(precision)
+    return cast
+
+
+def _with_network(emulator: Emulator, network: nn.Module) -> Emulator:
+    """The emulator with a copy of its network, which gets its weights."""
+    weights: list[Tensor] = list(emulator.processor.parameters())
+    copies: list[Tensor] = list(network.parameters())
+    with torch.no_grad():
+        torch._foreach_copy_(copies, weights)
+    for cast, weight in zip(copies, weights, strict=True):
+        cast.requires_grad_(weight.requires_grad)
+    other = copy.copy(emulator)
+    other._modules = {**emulator._modules, "processor": network}
+    return other
+
+
 def error_of_rows(
     error: Callable[[Emulator, Particles, Window, Tensor | None], Tensor],
-    emulator: Emulator,
     start: Particles,
     window: Window,
     noise: Tensor | None,
+    emulator: Emulator,
     rows: slice,
 ) -> Tensor:
     """`error(emulator, start, window, noise)` of some of the batch's windows."""
@@ -137,22 +185,29 @@ def error_of_rows(
 
 
 def mean_over_parts(
-    error: Callable[[slice], Tensor], mask: Tensor, rows: Sequence[slice], weights: Iterable[Tensor], threads: int
+    error: Callable[[Emulator, slice], Tensor],
+    mask: Tensor,
+    rows: Sequence[slice],
+    emulator: Emulator,
+    networks: CastNetworks,
+    threads: int,
 ) -> Tensor:
-    """The mean error () over the particles of all parts, with gradients to the weights.
+    """The mean error () over the particles of all parts, with gradients to the emulator's weights.
 
     Args:
         error: The mean over the particles of a part, with gradients.
         mask: (B, N) or (B, T, N) bool, True for particles.
         rows: From `split_rows`.
-        weights: Those that require gradients get them.
+        emulator: Computes the parts. Weights that require gradients get them.
+        networks: Of former steps.
         threads: How many threads work at most.
     """
     if len(rows) == 1:
-        return error(rows[0])
+        return error(emulator, rows[0])
     shares = [mask[part].sum() / mask.sum().clamp(min=1) for part in rows]
-    trained = [weight for weight in weights if weight.requires_grad]
-    mean: Tensor = _MeanOverParts.apply(error, shares, rows, threads, *trained)  # type: ignore[no-untyped-call]  # (torch's stubs)
+    trained = [weight for weight in emulator.parameters() if weight.requires_grad]
+    find = networks.prepare(emulator, len(rows))
+    mean: Tensor = _MeanOverParts.apply(error, shares, rows, find, threads, *trained)  # type: ignore[no-untyped-call]  # (torch's stubs)
     return mean
 
 
@@ -162,16 +217,20 @@ class _MeanOverParts(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        error: Callable[[slice], Tensor],
+        error: Callable[[Emulator, slice], Tensor],
         shares: Sequence[Tensor],
         rows: Sequence[slice],
+        find: Callable[[int], Emulator],
         threads: int,
         *weights: Tensor,
     ) -> Tensor:
         def compute(part: slice) -> tuple[Tensor, Sequence[Tensor | None]]:
+            number = rows.index(part)
+            emulator = find(number)
+            trained = [weight for weight in emulator.parameters() if weight.requires_grad]
             with torch.enable_grad():
-                mean = error(part) * shares[rows.index(part)]
-            return mean.detach(), torch.autograd.grad(mean, weights, allow_unused=True)
+                mean = error(emulator, part) * shares[number]
+            return mean.detach(), torch.autograd.grad(mean, trained, allow_unused=True)
 
         means, gradients = zip(*on_threads(compute, rows, threads), strict=True)
         ctx.gradients = [
@@ -182,7 +241,7 @@ class _MeanOverParts(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        return *(None,) * 4, *(None if gradient is None else slope * gradient for gradient in ctx.gradients)
+        return *(None,) * 5, *(None if gradient is None else slope * gradient for gradient in ctx.gradients)
 
 
 def _add(weight: Tensor, gradients: Sequence[Tensor | None]) -> Tensor | None:

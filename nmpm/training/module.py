@@ -34,7 +34,7 @@ from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.training import checkpoints, preflight
 from nmpm.training.augmentation import check_jitter, check_mirrors, mirror_half, noisy_start, with_jitter
-from nmpm.training.backpropagation import direct, error_of_rows, mean_over_parts, predict_window
+from nmpm.training.backpropagation import CastNetworks, direct, error_of_rows, mean_over_parts, predict_window
 from nmpm.training.budget import Clock, check_end, total_steps
 from nmpm.training.evaluation import EvaluatedModule, check_window
 from nmpm.training.losses import counted
@@ -113,7 +113,7 @@ class EmulatorModule(EvaluatedModule):
         check_mirrors(emulator.scene, self.mirror)
         check_jitter(emulator.scene, emulator.grid, jitter)
         self.recompute, self.compiled = recompute, compile
-        self.record, self._recorded = record, RecordedSteps()
+        self.record, self._recorded, self._networks = record, RecordedSteps(), CastNetworks()
         self.seed = seed
         arguments = emulator.recipe.to_dict() | {
             "unroll": unroll, "unroll_growth": unroll_growth, "gradient_discount": gradient_discount,
@@ -241,8 +241,8 @@ class EmulatorModule(EvaluatedModule):
             error = self._recorded.mean_error(mean_error, self.emulator, emulator, start, batch, count)
         else:
             rows, noise = self.rows(batch), training_noise(emulator, len(start.mask), self.members, count)
-            of = partial(error_of_rows, mean_error, emulator, start, batch, noise)
-            error = mean_over_parts(of, counts, rows, self.parameters(), self.threads or len(rows))
+            of = partial(error_of_rows, mean_error, start, batch, noise)
+            error = mean_over_parts(of, counts, rows, emulator, self._networks, self.threads or len(rows))
         loss, logged = global_mean(error, counts.sum() if counts.dim() == 2 else counts.sum() / counts.shape[1])
         self.log("train/loss", logged)
         return loss

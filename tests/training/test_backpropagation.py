@@ -13,7 +13,7 @@ from nmpm.emulator.rollouts import recomputed, unroll_with_gradients
 from nmpm.errors import ConfigError
 from nmpm.processors import FNO
 from nmpm.training import EmulatorModule
-from nmpm.training.backpropagation import direct, discount_gradients, mean_over_parts, split_rows
+from nmpm.training.backpropagation import CastNetworks, direct, discount_gradients, mean_over_parts, split_rows
 from nmpm.training.callbacks.threads import Threads
 from tests.trainings import TINY
 
@@ -131,6 +131,27 @@ def test_the_number_of_threads_changes_no_bit(step, precision):
         assert all(map(torch.equal, gradients(module, batch, 3, threads, precision), one))
 
 
+def test_weights_that_are_cast_once_have_the_error_and_the_gradients_of_autocast(step, monkeypatch):
+    module, batch = step()
+    frozen = next(module.parameters()).requires_grad_(False)
+    module.parts, module.threads = 3, 3
+    results = []
+    for prepare in (CastNetworks.prepare, lambda _, emulator, __: lambda _: emulator):
+        monkeypatch.setattr(CastNetworks, "prepare", prepare)
+        module.zero_grad()
+        torch.manual_seed(1)
+        with torch.autocast("cpu", torch.bfloat16):
+            loss = module.training_step(batch, 0)
+        loss.backward()
+        assert frozen.grad is None
+        slopes = [weight.grad for weight in module.parameters() if weight.requires_grad]
+        assert all(slope.dtype == torch.float32 for slope in slopes)
+        results.append((loss.item(), torch.cat([slope.flatten() for slope in slopes])))
+    (error, once), (same, plain) = results
+    assert error == same
+    assert (once - plain).norm() < 0.02 * plain.norm()
+
+
 def test_rollouts_in_parts_are_those_of_the_whole(step):
     module, batch = step()
     module.eval()
@@ -150,7 +171,7 @@ def test_an_error_in_a_thread_is_raised(step):
     module, batch = step()
     threads = torch.get_num_threads()
     with pytest.raises(ZeroDivisionError):
-        mean_over_parts(lambda _: 1 / 0, batch.mask, split_rows(7, 2), module.parameters(), 2)
+        mean_over_parts(lambda *_: 1 / 0, batch.mask, split_rows(7, 2), module.emulator, CastNetworks(), 2)
     assert torch.get_num_threads() == threads
 
 

@@ -135,8 +135,9 @@ class FreePath(torch.autograd.Function):
 
         for_each(move, len(fields), torch.get_num_threads())
         path = torch.from_numpy(start.path)
-        ctx.parameters = parameters
-        ctx.save_for_backward(*tensors, path)
+        ctx.parameters, ctx.precision = parameters, tensors[-2].dtype
+        *others, _, scale = tensors
+        ctx.save_for_backward(*others, scale, torch.from_numpy(fields), path)
         return path[:, 1:]
 
     @staticmethod
@@ -144,10 +145,8 @@ class FreePath(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients with respect to cells, velocity, state and output."""
         parameters: KernelParameters = ctx.parameters
-        *tensors, path = ctx.saved_tensors
-        output, scale = tensors[-2:]
-        start, fields = _to_arrays(parameters, *tensors)
-        start = start._replace(path=as_array(path))
+        *others, scale, predicted, path = ctx.saved_tensors
+        start, fields = _start_arrays(parameters, as_array(path), *others), as_array(predicted)
         grad_path, grad_velocity = np.empty_like(start.path), np.zeros_like(start.velocity)
         grad_path[:, 0], grad_path[:, 1:] = 0, grad.numpy()
         grad_state, grad_fields = np.zeros_like(start.state), np.zeros_like(fields)
@@ -162,23 +161,30 @@ class FreePath(torch.autograd.Function):
         for_each(follow, len(fields), torch.get_num_threads())
         to_output = torch.from_numpy(grad_fields).movedim(-1, 2).unflatten(3, parameters.shape)
         back = torch.from_numpy(grad_path[:, 0]), torch.from_numpy(grad_velocity), None, None, None
-        return None, *back, as_grid(grad_state, parameters.shape), (to_output * scale).to(output.dtype), None
+        return None, *back, as_grid(grad_state, parameters.shape), (to_output * scale).to(ctx.precision), None
 
 
-def _to_arrays(
-    parameters: KernelParameters, cells: Tensor, velocity: Tensor, gravity: Tensor, material: Tensor, mask: Tensor,
-    state: Tensor, output: Tensor, scale: Tensor,
-) -> tuple[StartArrays, Array]:  # fmt: skip
+def _to_arrays(parameters: KernelParameters, *tensors: Tensor) -> tuple[StartArrays, Array]:
     """The start, and the fields (B, m, size, C) of an output; tensors as of `FreePath.forward`."""
-    rows = as_array(state.movedim(1, -1)).reshape(len(cells), -1, state.shape[1])
-    kinds, pull = material_rows(material, parameters.materials), as_array(gravity)[:, 0]
-    fields = np.empty((*output.shape[:2], rows.shape[1], output.shape[2]), np.float32)
+    *others, output, scale = tensors
+    cells = others[0]
+    fields = np.empty((*output.shape[:2], parameters.size, output.shape[2]), np.float32)
     predicted, factors = output_array(output), as_array(scale.flatten(1))
     for_each(lambda b: unpack(predicted[b], factors, fields[b]), len(fields), torch.get_num_threads())
     path = np.empty((len(cells), output.shape[1] + 1, *cells.shape[1:]), np.float32)
     path[:, 0] = cells.detach().numpy()
+    return _start_arrays(parameters, path, *others), fields
+
+
+def _start_arrays(
+    parameters: KernelParameters, path: Array, cells: Tensor, velocity: Tensor, gravity: Tensor, material: Tensor,
+    mask: Tensor, state: Tensor,
+) -> StartArrays:  # fmt: skip
+    """The start of a path (B, m + 1, N, D); tensors as of `BundleStart`."""
+    rows = as_array(state.movedim(1, -1)).reshape(len(cells), -1, state.shape[1])
+    kinds, pull = material_rows(material, parameters.materials), as_array(gravity)[:, 0]
     sizes = np.empty((len(cells), 0), np.float32)
-    return StartArrays(path, as_array(velocity), pull, kinds, as_array(mask), sizes, rows), fields
+    return StartArrays(path, as_array(velocity), pull, kinds, as_array(mask), sizes, rows)
 
 
 class Gather(torch.autograd.Function):
