@@ -35,7 +35,12 @@ _OWN_BYTES = 2**28
 _IDLE_SECONDS = 10.0
 _PIPE_BYTES = 2**20
 _START = "from nmpm._support.isolated import serve; serve()"
-_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+_ENVIRONMENT = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MALLOC_ARENA_MAX": "2",
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+}
 """Threads, which a parser does not need, would count as memory."""
 
 
@@ -226,7 +231,7 @@ def _read_message(stream: Any) -> tuple[str, Any]:
         if set(item) != {"dtype", "shape"}:
             return item
         dtype = np.dtype(item["dtype"])
-        if dtype.kind not in "biufSU":
+        if dtype.kind not in "biufmMSU":
             raise ValueError("neither numbers nor texts")
         array = np.empty(item["shape"], dtype)
         octets = array.reshape(-1).view(np.uint8).data if array.size else memoryview(b"")

@@ -2,6 +2,7 @@
 
 import copy
 import random
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,7 +11,8 @@ from hypothesis import strategies as st
 
 Change = tuple[str, float, bytes]
 """What is done, where in the content (0 to 1), and with which bytes."""
-KINDS = ("flip", "flip", "flip", "cut", "insert", "write", "repeat")
+KINDS = ("flip", "flip", "flip", "cut", "insert", "write", "repeat", "inflate", "quote", "double")
+NUMBERS = (b"1000000000", b"-1", b"99999999999999999999", b"1e999", b"nan", b"4294967295", b"0", b"0x7fffffff", b"1.5")
 BLOCKS = (
     b"\xff" * 4, b"\xff" * 8, bytes(4), b"\x80", b"\x7f\xff\xff\xff", b"9" * 400, b"[" * 200, b"nan", b"-1", b"1e999",
 )  # fmt: skip
@@ -35,7 +37,10 @@ def random_changes(rng: random.Random) -> list[Change]:
 
 
 def damage(content: bytes, changes: list[Change]) -> bytes:
-    """The content after bits are flipped, bytes inserted, overwritten or repeated, or its end cut off."""
+    """The content after bits are flipped, bytes inserted, overwritten or repeated, or its end cut off.
+
+    In text a number becomes another one, quotes others, or a word, such as an attribute, or a line is there twice.
+    """
     data = bytearray(content)
     for kind, share, extra in changes:
         at = int(share * len(data))
@@ -49,6 +54,12 @@ def damage(content: bytes, changes: list[Change]) -> bytes:
             data[at : at + len(extra)] = extra
         elif kind == "repeat":
             data[at:at] = data[at : at + 4 * len(extra)]
+        elif kind == "inflate" and (number := re.search(rb"[-+]?\d[\d.]*", data[at:])):
+            data[at + number.start() : at + number.end()] = NUMBERS[extra[0] % len(NUMBERS)]
+        elif kind == "quote":
+            data = data.replace(*((b'"', b"'") if extra[0] % 2 else (b'"', b"")))
+        elif kind == "double" and (word := re.search((rb"\s\S+", rb"\n.*")[extra[0] % 2], data[at:])):
+            data[at + word.end() : at + word.end()] = word[0]
     return bytes(data)
 
 

@@ -97,6 +97,9 @@ class FrameStack:
             self._left_out.add(name)
             self._values.pop(name, None)
         for name, array in self._values.items():
+            if values[name].shape[1:] != array.shape[2:]:
+                shapes = f"{values[name].shape[1:]} per particle, but {array.shape[2:]} in {self._first}"
+                raise DataError(f"{where}: {one_line(name, 60)!r} has the shape {shapes}.")
             array[self._count, slots] = values[name]
 
     def _empty_array(self, values: np.ndarray) -> np.ndarray:

@@ -6,17 +6,18 @@ import csv
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from nmpm._support.bounded_files import check_regular
+from nmpm._support.isolated import call_isolated, iterate_isolated
 from nmpm._support.messages import install, one_line
 from nmpm._support.progress import progress_bar
-from nmpm.data.convert.base import readable
 from nmpm.data.convert.named_arrays import component_names
 from nmpm.data.convert.text_lines import Lines, is_number, open_lines, text_array
+from nmpm.data.parquet_columns import column_names, read_batches
 from nmpm.errors import ConfigError, DataError
 
 SUFFIXES = ("*.csv", "*.csv.gz", "*.tsv", "*.tsv.gz", "*.txt", "*.txt.gz", "*.parquet")
@@ -33,8 +34,8 @@ Chunk = Mapping[str, np.ndarray]
 def read_columns(path: Path) -> tuple[str, ...]:
     """Names of a table's columns; none if it has no header."""
     if path.suffix == ".parquet":
-        with _open_parquet(path) as file:
-            return tuple(map(str, file.schema_arrow.names))
+        _check_parquet(path)
+        return tuple(call_isolated(column_names, path))
     with open_lines(path, "a table") as lines:
         return _header(lines)[0]
 
@@ -47,9 +48,9 @@ def read_chunks(path: Path, columns: Sequence[str]) -> Iterator[Chunk]:
         ConfigError: if a package that reads the format is not installed.
     """
     if path.suffix == ".parquet":
-        with _open_parquet(path) as file:
-            for batch in file.iter_batches(batch_size=ROWS, columns=list(columns)):
-                yield {name: _arrow_column(batch.column(name)) for name in columns}
+        _check_parquet(path)
+        for batch in iterate_isolated(read_batches, path, list(columns), ROWS):
+            yield {name: _arrow_column(values) for name, values in batch.items()}
         return
     with open_lines(path, "a table") as lines, _progress(path) as advance_to:
         names, delimiter = _header(lines)
@@ -174,27 +175,18 @@ def as_numbers(values: np.ndarray, what: str) -> np.ndarray:
     return values
 
 
-@contextmanager
-def _open_parquet(path: Path) -> Iterator[Any]:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise ConfigError(f"{path}: reading Parquet needs pyarrow: {install('tables')}.") from error
+def _check_parquet(path: Path) -> None:
     check_regular(path)
-    with readable(path, "Parquet", pyarrow.ArrowException), pyarrow.parquet.ParquetFile(path) as file:
-        yield file
+    if find_spec("pyarrow") is None:
+        raise ConfigError(f"{path}: reading Parquet needs pyarrow: {install('tables')}.")
 
 
-def _arrow_column(column: Any) -> np.ndarray:
-    values = np.asarray(column.to_numpy(zero_copy_only=False))
-    if values.dtype.kind in "biuf":
-        return values.astype(np.float64)
+def _arrow_column(values: np.ndarray | list[str]) -> np.ndarray:
+    if isinstance(values, list):
+        return _column(values, ",")
     if values.dtype.kind == "m":  # durations, in seconds
         return values / np.timedelta64(1, "s")
-    if values.dtype.kind == "M":
-        return values
-    return _column(["" if item is None else str(item) for item in values.tolist()], ",")
+    return values if values.dtype.kind == "M" else values.astype(np.float64)
 
 
 def plain_column(name: str) -> str:
