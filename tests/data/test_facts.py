@@ -272,6 +272,10 @@ def test_what_speaks_against_gravity_is_said(rng, force, noise):
         assert gravity.value == pytest.approx(G, rel=5e-3, abs=0.05)
 
 
+def test_a_flight_of_few_frames_is_compared_with_nothing(rng):
+    assert facts_of(thrown(rng, (0.0, -2.0), frames=5), thrown(rng, (0.0, -2.0), frames=5)).gravity.value is not None
+
+
 class TestTime:
     def test_median_of_recorded_steps_and_a_word_on_uneven_ones(self, rng):
         run = thrown(rng, (0.0, -2.0), frames=20)

@@ -228,9 +228,9 @@ def _speaks_against(tracks: Sequence[Track], flights: Sequence[Flight]) -> str:
             accelerations.append(fitted.acceleration[free])
             velocities.append(fitted.velocity[free])
             places.append(path.mean(axis=0)[there][free])
-    acceleration, velocity, place = map(np.concatenate, (accelerations, velocities, places))
-    if len(acceleration) < _LEAST_FITS:
+    if sum(map(len, accelerations)) < _LEAST_FITS:
         return ""
+    acceleration, velocity, place = map(np.concatenate, (accelerations, velocities, places))
     along = (velocity * acceleration).sum(axis=1)
     speed = np.linalg.norm(velocity, axis=1)
     braked = along < -_OPPOSITE * speed * np.linalg.norm(acceleration, axis=1)

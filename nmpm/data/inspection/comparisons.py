@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from nmpm.data.facts.open_ends import Openings
 from nmpm.data.format import Metadata
 from nmpm.data.inspection.findings import Finding, Severity
 from nmpm.data.inspection.irregular_motion import FEW_CROSSINGS
@@ -52,7 +53,7 @@ def compare_time_steps(steps: Mapping[str, float], what: str) -> Iterator[Findin
 
 
 def compare_spacings(spacings: Mapping[str, tuple[float, float]]) -> Iterator[Finding]:
-    """Yields a finding if the spacings of particles, in two frames of each trajectory, differ between trajectories."""
+    """Yields a finding if particles' least and largest spacings both differ between trajectories."""
     if not spacings:
         return
     names, values = list(spacings), np.array(list(spacings.values()))
@@ -136,6 +137,22 @@ def check_crossings(metadata: Metadata, crossings: np.ndarray) -> Iterator[Findi
             Severity.CONTRADICTION,
             f"along {_axes(crossed)} it is stated as not periodic, but {int(crossings.sum())} times a particle leaves"
             f" at one end and is at the other. {correction('--boundary ' + _boundary(metadata, crossed, 'periodic'))}",
+        )
+
+
+def check_openings(metadata: Metadata, openings: Sequence[Openings]) -> Iterator[Finding]:
+    """Yields a finding if tracks end for good near the ends of an axis whose stated boundary lets nothing out."""
+    closed = np.asarray(metadata.boundary) != "open"
+    near = [opening for opening in openings if not opening.anywhere]
+    ends = np.array([sum(each.ends for each in near if axis in each.axes) for axis in range(metadata.dim)])
+    opened = (ends >= FEW_CROSSINGS) & closed
+    if opened.any():
+        yield Finding(
+            "boundary",
+            Severity.CONTRADICTION,
+            f"along {_axes(opened)} it is stated as {metadata.boundary[int(np.argmax(opened))]}, but {int(ends.max())}"
+            " particles are seen last near its ends, and then no more: they leave, or were lost."
+            f" {correction('--boundary ' + _boundary(metadata, opened, 'open'))}",
         )
 
 

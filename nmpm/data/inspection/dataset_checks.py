@@ -8,6 +8,7 @@ from collections import Counter
 import numpy as np
 
 from nmpm.data.facts.obstacles import never_moving, path_extents
+from nmpm.data.facts.open_ends import Openings, find_openings
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.inspection import comparisons
@@ -19,7 +20,7 @@ from nmpm.data.inspection.irregular_motion import (
     find_noise,
     find_swapped_axes,
 )
-from nmpm.data.inspection.motion import Motion, spacing_of
+from nmpm.data.inspection.motion import Motion, is_dense, spacing_of
 from nmpm.data.inspection.stated import check_stated, find_odd_particles, find_time_faults, free_fall
 from nmpm.data.statistics import Extent
 from nmpm.data.times import recorded_step
@@ -28,6 +29,8 @@ from nmpm.errors import DataError
 
 WINDOW = 18
 """Frames of a training window of the shipped configurations."""
+_SPACING_FRAMES = 5  # in which the spacing of a trajectory is measured
+_STEADY = 1.3  # factor between spacings of a trajectory
 _LEAST_PARTICLES = 32  # of which a spacing is compared
 
 
@@ -40,13 +43,15 @@ class DatasetChecks:
         self._findings: list[Finding] = []  # about single trajectories
         self._recorded_steps: dict[str, float] = {}  # time steps by trajectory
         self._steps_of_fall: dict[str, float] = {}
-        self._spacings: dict[str, tuple[float, float]] = {}
+        self._spacings: dict[str, tuple[float, float]] = {}  # least and largest of dense particles
+        self._sparse: dict[str, tuple[float, float]] = {}  # of others
         self._extents: dict[str, np.ndarray] = {}
         self._stays: dict[str, np.ndarray] = {}
         self._extent, self._walls = Extent(metadata.dim), Extent(metadata.dim)  # of moving and static particles
         self.spacing, self._rounding = math.inf, 0.0
         self._frames, self._still, self._moving = Counter[int](), Counter[int](), Counter[int]()
         self._crossings, self._wraps = np.zeros((2, metadata.dim), dtype=int)
+        self._openings: list[Openings] = []
         self._bounces = np.zeros((metadata.dim, 2), dtype=int)
 
     def add(self, trajectory: Trajectory, where: str) -> None:
@@ -77,9 +82,9 @@ class DatasetChecks:
         elif (dt := _dt_of_fall(motion)) is not None:
             self._steps_of_fall[motion.where] = dt
         if len(motion.index) >= _LEAST_PARTICLES and motion.spacing:
-            later = spacing_of(motion.position[len(motion.position) // 2], self.metadata)
-            if VOLUME not in motion.trajectory.attributes:
-                self._spacings[motion.where] = motion.spacing, later or motion.spacing
+            if VOLUME not in motion.trajectory.attributes and (found := _spacings(motion)):
+                dense, spacings = found
+                (self._spacings if dense else self._sparse)[motion.where] = spacings
             self._extents[motion.where], self._stays[motion.where] = motion.extent, motion.stays
         self.spacing = min(self.spacing, motion.spacing or math.inf)
         self._rounding = max(self._rounding, motion.rounding)
@@ -89,6 +94,8 @@ class DatasetChecks:
         self._moving.update(types[~still].tolist())
         self._crossings += motion.crossings.sum(axis=(1, 2))
         self._wraps += motion.wraps
+        if not motion.present.all():
+            self._openings.append(find_openings([motion.position], *motion.extent.T))
         self._bounces += motion.bounces
 
     def result(self) -> list[Finding]:
@@ -104,14 +111,30 @@ class DatasetChecks:
         findings: list[Finding] = []
         findings += comparisons.check_precision(self.spacing, self._rounding, self._extent)
         findings += comparisons.check_crossings(self.metadata, self._crossings)
+        findings += comparisons.check_openings(self.metadata, self._openings)
         findings += comparisons.check_periods(self.metadata, self._wraps, self._bounces, self._walls, self.spacing)
         findings += comparisons.check_types(self.metadata, self._still, self._moving)
-        findings += comparisons.compare_spacings(self._spacings)
+        findings += comparisons.compare_spacings(self._spacings or self._sparse)
         findings += comparisons.compare_domains(self._extents, self._stays, self.spacing)
         if np.isfinite(self._extent.lower).all():
             findings += comparisons.compare_bounds(self._extent, self._walls, self.metadata)
         findings += comparisons.check_lengths(self._frames, WINDOW)
         return findings
+
+
+def _spacings(motion: Motion) -> tuple[bool, tuple[float, float]] | None:
+    """Whether particles are dense in some frames, and the least and the largest spacing in these.
+
+    Where they never are, as material points that are drawn at random, all frames count; None if spacings differ then:
+    particles in flight.
+    """
+    frames = np.unique(np.linspace(0, len(motion.position) - 1, _SPACING_FRAMES).astype(int))
+    dense = [frame for frame in frames if is_dense(motion.position[frame], motion.metadata)]
+    spacings = [spacing_of(motion.position[frame], motion.metadata) for frame in dense or frames]
+    spacings = [spacing for spacing in spacings if spacing]
+    if not spacings or (not dense and max(spacings) > _STEADY * min(spacings)):
+        return None
+    return bool(dense), (min(spacings), max(spacings))
 
 
 def _dt_of_fall(motion: Motion) -> float | None:

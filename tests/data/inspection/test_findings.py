@@ -194,6 +194,31 @@ def lost(run: np.ndarray) -> np.ndarray:
     return run
 
 
+def stream(seed: int, reset: bool, out: bool = False) -> np.ndarray:
+    """Positions (T, N, 2) of a stream that comes in again as it leaves, or elsewhere (`reset`), or is gone (`out`)."""
+    rng = np.random.default_rng(seed)
+    position = thrown_block(seed)
+    start = rng.uniform((0, 0.3), (1, 0.7), (SIDE**2, 2))
+    flight = start + DT * np.arange(FRAMES)[:, None, None] * np.array([1.5, 0.0])
+    turns = np.floor(flight[..., 0])
+    flight[..., 0] -= turns
+    flight[..., 1] += np.where(turns > 0, rng.uniform(-0.3, 0.3, SIDE**2), 0) if reset else 0
+    position[:, : SIDE**2] = np.where(turns[..., None] > 0, np.nan, flight) if out else flight
+    return position
+
+
+def rain(seed: int, spacing: float, duration: int) -> np.ndarray:
+    """Positions (T, N, 2) of grains that come from far apart to rest on a lattice, after so many frames."""
+    rng = np.random.default_rng(seed)
+    rest = np.float64(thrown_block(seed)[0, : SIDE**2] * 0)
+    rest += spacing * np.stack(np.meshgrid(*[np.arange(SIDE)] * 2, indexing="ij"), -1).reshape(-1, 2)
+    above = rest + rng.uniform((0, 0.2), (0.5, 0.7), rest.shape)
+    share = np.clip(np.arange(FRAMES) / duration, 0, 1)[:, None, None] ** 2
+    position = thrown_block(seed)
+    position[:, : SIDE**2] = above + share * (rest - above)
+    return position
+
+
 def record(data: Data, time: np.ndarray, frames: np.ndarray, velocity_unit: float = 0.0) -> None:
     """Keeps some frames of all runs, at times that are recorded; with velocities, in some unit of time."""
     data.change_all(lambda run: run[frames])
@@ -304,6 +329,25 @@ def test_times_and_velocities_of_other_units_are_a_note(unit, data, tmp_path):
     findings = data.findings(tmp_path)
     assert [finding.severity for finding in findings] == ([] if unit == 1 else [Severity.NOTE])
     assert all(f"frames are {DT / unit:.4g} apart by recorded times" in finding.sentence for finding in findings)
+
+
+@pytest.mark.parametrize(
+    ("reset", "out", "told"), [(False, False, "periodic"), (True, False, ""), (False, True, "open")]
+)
+def test_a_boundary_is_periodic_only_where_particles_go_on_as_they_came(data, tmp_path, reset, out, told):
+    data.runs = {name: [stream(seed, reset, out) for seed, _ in enumerate(runs)] for name, runs in data.runs.items()}
+    data.state(gravity=None, particle_volume=None)
+    found = [str(finding) for finding in data.findings(tmp_path) if finding.kind == "boundary"]
+    assert [re.findall(r"--boundary (\w+),wall", each) for each in found] == ([[told]] if told else [])
+
+
+@pytest.mark.parametrize("coarse", [1.0, 2.0])
+def test_grains_in_flight_are_of_no_other_resolution(data, tmp_path, coarse):
+    kinds_of_rain = [(SPACING, 20), (SPACING, 90), (SPACING * coarse, 24)]
+    data.runs = {"train": [rain(seed, *kind) for seed, kind in enumerate(kinds_of_rain)]}
+    data.state(gravity=None, particle_volume=None)
+    kinds = {finding.kind for finding in data.findings(tmp_path)}
+    assert ("different resolution" in kinds) == (coarse > 1)
 
 
 def test_other_units_change_no_finding(data, tmp_path):
