@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from nmpm._support.bounded_files import check_regular
+from nmpm._support.isolated import call_isolated, iterate_isolated
 from nmpm._support.messages import install
 from nmpm.data.convert.base import readable
 from nmpm.data.convert.frame import Frame, wrap
 from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.data.gsd_chunks import STEP, count_frames, read_chunks
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Boundary, Interval
 
-_ARRAYS = (
-    "particletype",
-    "velocity",
-    "diameter",
-    "mass",
-    "charge",
-    "body",
-    "orientation",
-    "angmom",
-    "density",
-    "pressure",
-)
+_FACTS = ("N", "position", "typeid", "types")
 _PERIODIC: tuple[Boundary, ...] = ("periodic",) * 3
 
 
@@ -41,51 +32,40 @@ class Gsd(FrameFormat):
     patterns: tuple[str, ...] = ("*.gsd",)
 
     def frames(self, file: Path) -> Iterator[Frame]:
-        with _open(file) as content:
-            for index in range(content.nframes):
-                with readable(file, "GSD", RuntimeError, LookupError, TypeError):
-                    frame = _frame(content, index, f"{file}, frame {index}")
-                yield frame
+        _check(file)
+        for index, chunks in enumerate(iterate_isolated(read_chunks, file)):
+            with readable(file, "GSD", LookupError, TypeError):
+                frame = _frame(chunks, index, f"{file}, frame {index}")
+            yield frame
 
     def count(self, file: Path) -> int:
-        with _open(file) as content:
-            return int(content.nframes)
+        _check(file)
+        return int(call_isolated(count_frames, file))
 
 
-@contextmanager
-def _open(file: Path) -> Iterator[Any]:
+def _check(file: Path) -> None:
     check_regular(file)
-    try:
-        import gsd.fl
-    except ImportError as error:
-        raise ConfigError(f"{file}: reading GSD needs gsd: {install('gsd')}.") from error
-    with readable(file, "GSD", RuntimeError, LookupError, TypeError):
-        content = gsd.fl.open(str(file), "r", schema="hoomd")
-    with content:
-        yield content
+    if find_spec("gsd") is None:
+        raise ConfigError(f"{file}: reading GSD needs gsd: {install('gsd')}.")
 
 
-def _frame(content: Any, index: int, where: str) -> Frame:
-    def read(name: str) -> np.ndarray | None:
-        frame = next((frame for frame in (index, 0) if content.chunk_exists(frame=frame, name=name)), None)
-        return None if frame is None else np.asarray(content.read_chunk(frame=frame, name=name))
-
-    position = read("particles/position")
+def _frame(chunks: Mapping[str, np.ndarray], index: int, where: str) -> Frame:
+    position, count, step = (chunks.get(name) for name in ("particles/position", "particles/N", STEP))
     if position is None or position.ndim != 2:
         raise DataError(f"{where}: it has no particles/position.")
-    count = read("particles/N")
     if count is not None and int(count[0]) != len(position):
         raise DataError(f"{where}: it declares {int(count[0])} particles and has positions of {len(position)}.")
-    values = {name: read(f"particles/{'typeid' if name == 'particletype' else name}") for name in _ARRAYS}
-    arrays = {name: array for name, array in values.items() if array is not None and len(array) == len(position)}
-    names = read("particles/types")
+    own = {name.removeprefix("particles/"): values for name, values in chunks.items() if name.startswith("particles/")}
+    arrays = {name: values for name, values in own.items() if name not in _FACTS and len(values) == len(position)}
+    types, names = own.get("typeid"), own.get("types")
+    if types is not None and len(types) == len(position):
+        arrays["particletype"] = types
     if names is not None and "particletype" in arrays:
         texts = [bytes(row.astype(np.uint8)).split(b"\0")[0].decode("utf-8", "replace") for row in names]
         arrays["type"] = np.array(texts)[arrays["particletype"]]
-    own_step = content.chunk_exists(frame=index, name="configuration/step")
-    step = int(content.read_chunk(frame=index, name="configuration/step")[0]) if own_step else None
-    frame = Frame(position.astype(np.float64), arrays, None, 0 if index == 0 and step is None else step)
-    box = _box(read("configuration/box"), where)
+    number = (0 if index == 0 else None) if step is None else int(step[0])
+    frame = Frame(position.astype(np.float64), arrays, None, number)
+    box = _box(chunks.get("configuration/box"), where)
     return (
         frame
         if box is None

@@ -1,5 +1,6 @@
 """GSD files that gsd writes."""
 
+import random
 import re
 import sys
 from pathlib import Path
@@ -10,7 +11,8 @@ import pytest
 from nmpm._support.messages import install
 from nmpm.data.convert import convert, open_dataset
 from nmpm.data.format import Split, read_metadata
-from nmpm.errors import ConfigError, DataError
+from nmpm.errors import ConfigError, DataError, NmpmError
+from tests.data.fuzzing import damage, random_changes
 
 fl = pytest.importorskip("gsd.fl", reason="the extra `gsd` is not installed")
 T, N = 8, 5
@@ -58,9 +60,26 @@ def test_what_cannot_be_read_is_named(tmp_path, monkeypatch):
         convert(write(tmp_path / "run.gsd", [2, 2, 2, 0, 0.5, 0]), tmp_path / "out")
     path = write(tmp_path / "cut.gsd")
     path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(DataError, match=r"cut.gsd: cannot be read as GSD"):
+    with pytest.raises(DataError, match=r"cut.gsd: cannot be read"):
         convert(path, tmp_path / "out", "gsd")
     monkeypatch.setitem(sys.modules, "gsd", None)
     monkeypatch.setitem(sys.modules, "gsd.fl", None)
     with pytest.raises(ConfigError, match=re.escape(f"reading GSD needs gsd: {install('gsd')}.")):
         convert(tmp_path / "run.gsd", tmp_path / "out", "gsd")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_damaged_files_give_typed_errors(tmp_path):
+    """Also where gsd itself crashes, as of seed 265."""
+    path = write(tmp_path / "run.gsd", [2, 2, 2, 0, 0, 0])
+    content, errors = path.read_bytes(), list[str]()
+    for seed in range(225, 325):
+        path.write_bytes(damage(content, random_changes(random.Random(f"gsd {seed}"))))
+        try:
+            for start in open_dataset(path).splits.values():
+                list(start())
+        except NmpmError as error:
+            errors.append(str(error))
+    assert len(errors) > 20
+    assert not [error for error in errors if "\n" in error]
