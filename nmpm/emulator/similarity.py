@@ -37,6 +37,8 @@ _COARSE_COST = 0.3
 """Of the squared logarithm by which a box is fewer cells across: heaps and gaps of few cells are predicted worst."""
 _SAME_UNITS = 4.0
 """Factor between the distances of particles of scenes that may be in the same unit of length."""
+_ROUNDING = 1e-6
+"""Relative difference of lengths that are the same in two units."""
 _MOST_CELLS = 4_000_000
 _UNKNOWN = Motion()
 
@@ -162,7 +164,7 @@ class _Search:
         Raises:
             ConfigError: if there would be too many cells.
         """
-        kept = self._same_data() or self._same_units()
+        kept = self._same_data() or self._same_cells()
         if kept and stride in (None, kept[1]):
             return kept
         grids = (
@@ -170,7 +172,7 @@ class _Search:
             for each in ([stride] if stride else self._strides())
             for scale in self._scales(each)
         )
-        stride, grid = min(grids, key=lambda choice: self._cost(*choice))
+        stride, grid = min(grids, key=lambda choice: round(self._cost(*choice), 9))  # in all units the same of equals
         if math.prod(grid.cells) > _MOST_CELLS:
             raise ConfigError(
                 f"{names[1]} would need {' x '.join(map(str, grid.cells))} cells of {mean_width(grid.widths):.3g}"
@@ -191,18 +193,49 @@ class _Search:
         scene = dataclasses.replace(theirs, domain=mine.domain, dt=mine.dt, obstacles=obstacles)
         return dataclasses.replace(self.emulator.recipe, scene=scene), stride
 
-    def _same_units(self) -> tuple[EmulatorRecipe, Fraction] | None:
-        """The model's cells for a scene in its units, with its time step and gravity that it knows; None for others."""
-        apart = self.scene.particle_spacing / self.emulator.scene.particle_spacing
-        if not 1 / _SAME_UNITS < apart < _SAME_UNITS:
-            return None
-        try:
-            recipe = self.emulator.recipe.over(self.scene)
-        except ConfigError:
-            return None
-        figures, (fewest, most) = self._figures(recipe.grid.spacing, Fraction(1)), self.seen.spacings
-        fits = fewest <= figures.spacing <= most and math.isclose(self.seen.motion_factor(figures), 1.0)
-        return (recipe, Fraction(1)) if fits or not recipe.scene.gravity_varies else None
+    def _same_cells(self) -> tuple[EmulatorRecipe, Fraction] | None:
+        """The model's cells for a scene with its time step and gravity that it knows, in any unit; None for others."""
+        for unit in self._units():
+            try:
+                recipe = self.emulator.recipe.over(self._in_unit(unit))
+            except ConfigError:
+                continue
+            figures = self._figures([unit * width for width in recipe.grid.spacing], Fraction(1))
+            fewest, most = self.seen.spacings
+            dense = fewest * (1 - _ROUNDING) <= figures.spacing <= most * (1 + _ROUNDING)
+            fits = dense and math.isclose(self.seen.motion_factor(figures), 1.0)
+            if fits or (unit == 1.0 and not recipe.scene.gravity_varies):
+                return dataclasses.replace(recipe, scene=self.scene), Fraction(1)
+        return None
+
+    def _units(self) -> Iterator[float]:
+        """Lengths of the data that may be one of the model's: the likeliest first."""
+        mine, theirs = self.emulator.scene, self.scene
+        apart = theirs.particle_spacing / mine.particle_spacing
+        sides = [(b[1] - b[0]) / (a[1] - a[0]) for a, b in zip(mine.domain, theirs.domain, strict=True)]
+        same_box = max(sides) <= min(sides) * (1 + _ROUNDING)
+        if same_box and math.isclose(sides[0], apart, rel_tol=_ROUNDING):
+            yield 1.0 if math.isclose(apart, 1.0) else sides[0]
+        decimal = round(math.log10(apart))
+        powers = [10.0**power for power in range(decimal - 1, decimal + 2)]
+        powers.sort(key=lambda unit: abs(math.log(apart / unit)))
+        yield from (unit for unit in powers if 1 / _SAME_UNITS < apart / unit < _SAME_UNITS)
+        if same_box:
+            yield sides[0]
+
+    def _in_unit(self, unit: float) -> Scene:
+        """The scene with lengths in a unit, of the data's."""
+        scene = self.scene
+        if unit == 1.0:
+            return scene
+        bounds, domain = (
+            tuple((low / unit, high / unit) for low, high in sides) for sides in (scene.bounds, scene.domain)
+        )
+        gravity, usual = scene.gravity and tuple(value / unit for value in scene.gravity), self.emulator.scene.gravity
+        if gravity and usual and math.dist(gravity, usual) <= _ROUNDING * math.hypot(*usual):
+            gravity = usual
+        volume = scene.particle_volume / unit**scene.dim
+        return dataclasses.replace(scene, bounds=bounds, domain=domain, gravity=gravity, particle_volume=volume)
 
     def _strides(self) -> Iterator[Fraction]:
         """Those of `STRIDES` with which trajectories are long enough for a start and a bundle of the model's frames."""

@@ -6,6 +6,8 @@ from itertools import permutations, product
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scenes import box, cloud, emulator_of
 
 from nmpm.emulator import EmulatorRecipe, differentiable_rollout, rollout
@@ -219,10 +221,7 @@ def test_cells_keep_the_ratio_of_their_sides():
 
 
 def test_a_model_that_is_told_gravity_takes_any_up_to_its_own():
-    emulator = model_of(box(gravity=None, gravity_varies=True))
-    strongest = 9.81 * 0.0025**2 / emulator.grid.spacing[0]
-    emulator.input_std[-2:] = strongest / 2
-    emulator.input_low[-2:], emulator.input_high[-2:] = -2 * strongest, 2 * strongest
+    emulator = knowing_gravity()
     sideways = in_other_units(box(), gravity=(0.8 * 9.81 * 250 / 1600, 0.0))
     match = find_match(emulator, sideways)
     assert not match.warnings
@@ -296,6 +295,41 @@ TURNS = [
 def along(vectors, turn):
     """Vectors (..., D) in the axes that a turn makes of theirs."""
     return vectors[..., list(turn.sources)] * torch.tensor([-1.0 if mirror else 1.0 for mirror in turn.mirrored])
+
+
+def in_unit(scene, unit):
+    """The scene in a unit of length, of which so many are one of its own."""
+    return in_other_units(scene, unit, 1.0, (0.0,) * scene.dim)
+
+
+def knowing_gravity():
+    """A model of scenes whose gravity differs, up to that of `box()`."""
+    emulator = model_of(box(gravity=None, gravity_varies=True))
+    strongest = 9.82 * 0.0025**2 / emulator.grid.spacing[0]
+    emulator.input_mean[-2:], emulator.input_std[-2:] = 0.0, strongest / 2
+    emulator.input_low[-2:], emulator.input_high[-2:] = -2 * strongest, 2 * strongest
+    return emulator
+
+
+@given(unit=st.floats(1e-4, 1e4), varies=st.booleans())
+@settings(max_examples=10, deadline=None)
+def test_a_scene_of_the_model_has_its_cells_in_any_unit(unit, varies):
+    emulator = knowing_gravity() if varies else model_of()
+    emulator.recipe = dataclasses.replace(emulator.recipe, particles_per_cell=(1.0, 9.0))
+    scene = in_unit(box(), unit)
+    assert find_match(emulator, scene, stride=Fraction(1)).recipe.cells == emulator.recipe.cells
+
+
+@given(unit=st.sampled_from([1e-6, 1e-3, 1e-2, 10.0, 1e3, 1e6]), spacing=st.floats(0.5, 1.5), wider=st.integers(1, 4))
+@settings(max_examples=6, deadline=None)
+def test_a_scene_has_as_many_cells_in_micrometres_as_in_metres(unit, spacing, wider):
+    emulator, h = knowing_gravity(), 0.84 / 24
+    scene = box(
+        domain=((0.08, 0.92 + wider * h), (0.08, 0.92)), bounds=((0.1, 0.9 + wider * h), (0.1, 0.9)),
+        particle_volume=(0.02 * spacing) ** 2,
+    )  # fmt: skip
+    expected = find_match(emulator, scene, stride=Fraction(1))
+    assert find_match(emulator, in_unit(scene, unit), stride=Fraction(1)).recipe.cells == expected.recipe.cells
 
 
 def in_axes(state, turn):
