@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+from typing import Any, TextIO
 
 
 def one_line(text: object, limit: int = 200) -> str:
@@ -42,3 +45,49 @@ def plain_warnings() -> Iterator[None]:
         yield
     finally:
         warnings.formatwarning = before
+
+
+class _UnfailingStream:
+    """A text stream whose writes never raise: after the first that fails, as of a closed pipe, it writes nowhere."""
+
+    def __init__(self, stream: TextIO | None) -> None:
+        self._stream = _nowhere() if stream is None else stream  # (None: closed before the process started)
+        if hasattr(self._stream, "reconfigure"):
+            self._stream.reconfigure(errors="replace")  # letters that the terminal's encoding lacks
+
+    def write(self, text: str) -> int:
+        try:
+            return self._stream.write(text)
+        except (OSError, ValueError):
+            self._stream = _nowhere()
+            return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            self.write(line)
+
+    def flush(self) -> None:
+        try:
+            self._stream.flush()
+        except (OSError, ValueError):
+            self._stream = _nowhere()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def _nowhere() -> TextIO:
+    return open(os.devnull, "w", encoding="utf-8")
+
+
+@contextmanager
+def unfailing_output() -> Iterator[None]:
+    """Let nothing that is printed end the work: not a closed pipe, a full disk, or an encoding without the letters."""
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (_UnfailingStream(stream) for stream in before)
+    try:
+        yield
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        sys.stdout, sys.stderr = before

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 
 from nmpm._support.messages import suggestion
@@ -19,8 +20,15 @@ def shipped_folder(folder: str) -> Path:
 
 
 def user_home() -> Path:
-    """The user's folder of datasets and models: the environment variable `NMPM_HOME`, else `~/.cache/nmpm`."""
-    return Path(os.environ.get("NMPM_HOME") or Path.home() / ".cache" / "nmpm").expanduser()
+    """The user's folder of datasets and models: the environment variable `NMPM_HOME`, else `~/.cache/nmpm`.
+
+    Users without a home folder, as in containers, have one of their number in the folder of temporary files.
+    """
+    given = os.environ.get("NMPM_HOME") or "~/.cache/nmpm"
+    try:
+        return Path(given).expanduser()
+    except RuntimeError:  # no HOME, and no such user
+        return Path(tempfile.gettempdir()) / f"nmpm-{os.getuid()}"
 
 
 def user_zoo() -> Path:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from importlib import import_module
 
-from nmpm._support.messages import plain_warnings
+from nmpm._support.messages import plain_warnings, unfailing_output
 from nmpm._support.threads import limit_spinning
 from nmpm._support.version import __version__
 from nmpm.errors import NmpmError
@@ -87,13 +88,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit status: 0 for success, 1 for an error, 2 for a wrong call, 3 for a training that has diverged, 130 for
         an interruption.
     """
+    with unfailing_output():
+        return _main(list(sys.argv[1:] if arguments is None else arguments))
+
+
+def _main(words: list[str]) -> int:
     limit_spinning()
     if "_ARGCOMPLETE" in os.environ:  # the shell asks what a line may go on with
         from nmpm.cli.completion import complete
 
         complete()
         return 0
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    words = [expand_home(word) for word in words]
     if not words or words[0] in ("-h", "--help", "help"):
         sys.stdout.write(usage())
         return 0 if words else 2
@@ -113,10 +119,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(f"nmpm {words[0]}: {error}\n")
         return error.exit_status
     except OSError as error:
-        if error.filename is None or error.strerror is None:
+        if error.strerror is None:
             raise
-        sys.stderr.write(f"nmpm {words[0]}: {error.filename}: {error.strerror.lower()}.\n")
+        file = "" if error.filename is None else f"{error.filename}: "
+        sys.stderr.write(f"nmpm {words[0]}: {file}{error.strerror.lower()}.\n")
         return 1
     except KeyboardInterrupt as interrupt:
         sys.stderr.write(f"\nnmpm {words[0]}: {interrupt or 'interrupted.'}\n")
         return 130
+
+
+def expand_home(word: str) -> str:
+    """A word of the command line, or a text of a configuration, with the home folder for a `~` that begins its path.
+
+    Shells do so only where a word begins with it, not in --out=~/r.h5.
+    """
+    option, path = re.fullmatch(r"(--?[\w.]+=)?(.*)", word, re.DOTALL).groups("")  # type: ignore[union-attr]  # (matches all)
+    return option + os.path.expanduser(path) if re.match(r"~\w*(/|$)", path) else word

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
 
 from nmpm.cli.doctor_facts import Fact, collect, sections
 from nmpm.cli.options import HelpFormatter, add_device_option, check_device
@@ -66,6 +66,6 @@ def _print(title: str, facts: Callable[[], Iterator[Fact]]) -> list[str]:
 
 
 def _write(text: str) -> None:
-    home = str(Path.home())
+    home = os.path.expanduser("~")  # (Path.home() raises where there is none)
     sys.stdout.write(text if home == "/" else text.replace(home, "~"))
     sys.stdout.flush()

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from nmpm._support.bounded_files import read_yaml
 from nmpm._support.shipped import PACKAGE, check_dataset, find_config
+from nmpm.cli import expand_home
 from nmpm.cli.options import check_model
 from nmpm.errors import ConfigError, DataError
 
@@ -169,7 +170,8 @@ def _value(options: Sequence[Option], configs: Sequence[Mapping[str, Any]], key:
     for config in reversed(configs):
         inner = config.get(section) if section else config
         if isinstance(inner, Mapping) and name in inner:
-            return inner[name]
+            value = inner[name]
+            return expand_home(value) if isinstance(value, str) else value
     return None
 
 

@@ -23,6 +23,7 @@ from nmpm._support.atomic import atomic_write
 from nmpm._support.bounded_files import check_yaml
 from nmpm._support.messages import one_line
 from nmpm._support.plain_data import load_plugins
+from nmpm.cli import expand_home
 from nmpm.cli.console import quiet_lightning
 from nmpm.cli.early_checks import UsageError
 from nmpm.cli.emulator_cli import EmulatorCLI
@@ -50,7 +51,16 @@ def load_checked(text: str) -> Any:
         rest, count = re.subn(r"\$\{[^${}:]*\}", "", rest)
     if left := re.search(r"\$\{[^}]*\}?", rest):
         raise ValueError(f"{one_line(left[0], 60)}: ${{…}} refers to other keys of the configuration, to nothing else.")
-    return value
+    return _with_home(value)
+
+
+def _with_home(value: Any) -> Any:
+    """What a configuration holds, with the home folder for a `~` that begins a text."""
+    if isinstance(value, dict):
+        return {key: _with_home(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_with_home(one) for one in value]
+    return expand_home(value) if isinstance(value, str) else value
 
 
 def load_shared(text: str, trusted: frozenset[str]) -> Any:

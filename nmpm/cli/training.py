@@ -13,10 +13,11 @@ import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import yaml
 
+from nmpm._support.messages import counted
 from nmpm._support.shipped import PACKAGE
 from nmpm.cli import COMMANDS
 from nmpm.cli.early_checks import (
@@ -35,11 +36,16 @@ from nmpm.cli.run_folder import CONFIG, RunFolder
 from nmpm.cli.trust import NAME, OPTION, foreign_names, trust_advice
 from nmpm.errors import ConfigError
 
+if TYPE_CHECKING:
+    from nmpm.data.convert import Options
+
 FINE_TUNING = PACKAGE / "cli" / "fine_tune.yaml"
 """The configuration of fine-tunings that name none."""
 ROOT, CHECKPOINT = "--trainer.default_root_dir", "--ckpt_path"
 
 
+FEWEST_STEPS = 2_000
+"""Steps of single particles, from frame to frame, from which on a training is started without being asked for."""
 _REPLACED = {"--help_all": "--help", "--strict": "--strict=true"}
 
 
@@ -49,6 +55,7 @@ def run(words: list[str]) -> int:
     if "--help" in words or "-h" in words:
         sys.stdout.write(training_help(command, COMMANDS[command][1]))
         return 0
+    forget_unused_slurm()
     try:
         options = read_options([_REPLACED.get(word, word) for word in words[1:]])
         trusts = Option(OPTION) in options
@@ -81,6 +88,15 @@ def check_trust(own: Sequence[Option], options: Sequence[Option]) -> None:
                 raise ConfigError(f"{value} {trust_advice(foreign)}")
 
 
+def forget_unused_slurm() -> None:
+    """Remove SLURM's number of tasks from the environment of a process that srun has not started as one of them.
+
+    In an interactive job, or a batch script without srun, there is one process: Lightning would wait for the others.
+    """
+    if not {"SLURM_STEP_ID", "SLURM_STEPID"} & os.environ.keys() or "SLURM_PTY_PORT" in os.environ:
+        os.environ.pop("SLURM_NTASKS", None)
+
+
 def check_match_options(command: str, options: Sequence[Option]) -> None:
     """Raise ConfigError if --materials or --stride cannot be read, or a training that starts from no model has them."""
     given = {option.name: option.value for option in options}
@@ -97,25 +113,49 @@ def add_configuration(options: Sequence[Option]) -> list[Option]:
     That of fine-tunings where they start from a model, or else one that is written for the data.
 
     Raises:
-        ConfigError: in one of several processes, which would write different ones.
+        ConfigError: in one of several processes, which would write different ones; for too little data.
     """
     given = {option.name: option.value for option in options}
     path = given.get("--data.path")
     if path is None or path in NOT_FILES or "--config" in given or "--print_config" in given:
         return list(options)
-    if "--start_from" in given:
-        return _add_fine_tuning(options, Path(path))
-    if any(int(os.environ.get(name) or 1) > 1 for name in ("WORLD_SIZE", "SLURM_NTASKS")):
-        raise ConfigError(f"Several processes need one --config: write it first, by nmpm init {path}.")
-    from nmpm.cli.init import MINUTES, dataset_name, write_for_fit
     from nmpm.data.convert import Options
     from nmpm.data.new_configuration import OPTIONS
 
     stated = {name: yaml.safe_load(given.get(f"--data.{name}") or "null") for name in OPTIONS}
     stated["prescribed"] = stated["prescribed"] and frozenset(stated["prescribed"])
+    facts = Options(**stated)
+    if not {"--trainer.max_steps", "--trainer.max_time"} & given.keys():
+        check_enough_data(Path(path), facts)
+    if "--start_from" in given:
+        return _add_fine_tuning(options, Path(path))
+    if any(int(os.environ.get(name) or 1) > 1 for name in ("WORLD_SIZE", "SLURM_NTASKS")):
+        raise ConfigError(f"Several processes need one --config: write it first, by nmpm init {path}.")
+    from nmpm.cli.init import MINUTES, dataset_name, write_for_fit
+
     root = Path(given.get(ROOT) or f"runs/{dataset_name(Path(path))}")
     minutes = _minutes(given.get("--trainer.max_time") or "") or MINUTES
-    return [Option("--config", str(write_for_fit(Path(path), Options(**stated), root, minutes))), *options]
+    return [Option("--config", str(write_for_fit(Path(path), facts, root, minutes))), *options]
+
+
+def check_enough_data(path: Path, facts: Options) -> None:
+    """Raise ConfigError if there is so little to train on that the minutes of a training would be wasted."""
+    from nmpm.data.format import Split
+    from nmpm.data.loading.sources import FolderSource
+    from nmpm.data.split_files import split_paths
+
+    source = FolderSource(path, facts)
+    splits = split_paths(source.folder)
+    split = Split(splits.get("train") or next(iter(splits.values())))
+    frames = [split.frames(index) for index in range(len(split))]
+    particles = [int(source.metadata.is_moving(split.particle_type(index)).sum()) for index in range(len(split))]
+    steps = sum(max(0, count - 2) * moving for count, moving in zip(frames, particles, strict=True))
+    if steps < FEWEST_STEPS:
+        raise ConfigError(
+            f"{path}: too little to learn from: {counted(sum(frames), 'frame')} of at most"
+            f" {counted(max(particles), 'particle')} to train on are {steps:,} steps of particles; {FEWEST_STEPS:,} are"
+            " the fewest. Add trajectories, or longer ones; --trainer.max_time 00:00:15:00 trains on these anyway."
+        )
 
 
 def _add_fine_tuning(options: Sequence[Option], path: Path) -> list[Option]:

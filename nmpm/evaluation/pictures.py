@@ -27,7 +27,8 @@ def labelled_trajectories(scene: Scene, window: Window, predicted: Tensor, title
     prediction = torch.cat([truth[:2], predicted[0][:, real]])
     broken = ~prediction.isfinite().flatten(1).all(1)
     if window.present is not None:  # (NaN where a particle is absent)
-        broken = prediction.isinf().flatten(1).any(1) | prediction.isnan().flatten(1).all(1)
+        lost = prediction.isnan().flatten(1).all(1) & window.present[0, : len(prediction), real].any(1)
+        broken = prediction.isinf().flatten(1).any(1) | lost
     frames = int(broken.int().argmax()) if broken.any() else len(prediction)
     rows = {"truth": truth[:frames].numpy(), "prediction": prediction[:frames].numpy()}
     obstacle = window.obstacle[0, window.obstacle_mask[0]].numpy()

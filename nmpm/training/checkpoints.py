@@ -41,7 +41,13 @@ class AtomicCheckpointIO(TorchCheckpointIO):
             super().save_checkpoint(checkpoint, path)
             return
         with atomic_write(Path(path)) as part:
-            torch.save(checkpoint, part)
+            try:
+                torch.save(checkpoint, part)
+            except RuntimeError as error:  # (torch's writer says so of a full disk or quota)
+                raise DataError(
+                    f"{path} cannot be written: the disk, or your quota, is full. An earlier checkpoint stays as it"
+                    " was: free some space, and go on with nmpm fit --resume RUN."
+                ) from error
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -6,8 +6,11 @@ Lightning itself rejects further options when the Trainer is made. `docs/lightni
 from __future__ import annotations
 
 import copy
+import errno
 import logging
+import os
 import shutil
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -58,6 +61,7 @@ REPORT_BYTES = 32 * 2**20
 MEMORY_MARGIN = 1.25
 """Times the free memory that a training's estimate may reach: estimates are within a quarter."""
 
+_ELSEWHERE = "Free some, or write elsewhere with --trainer.default_root_dir."
 _COUNT_EPOCHS = "needs epochs that end, and batches are endless: give limit_train_batches=N and max_epochs"
 
 
@@ -258,13 +262,27 @@ def check_disk(trainer: Trainer, module: LightningModule) -> None:
         existing = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.is_dir())
         free = shutil.disk_usage(existing).free
         message = (
-            f"{folder}: {free >> 20} MB of disk are free; checkpoints and report need up to {needed >> 20} MB. Free"
-            " some, or write elsewhere with --trainer.default_root_dir."
+            f"{folder}: {free >> 20} MB of disk are free; checkpoints and report need up to {needed >> 20} MB."
+            f" {_ELSEWHERE}"
         )
         if free < needed:
             raise ConfigError(message)
+        if not _is_granted(existing, needed):
+            raise ConfigError(f"{folder}: your quota there, or the disk, has no {needed >> 20} MB left. {_ELSEWHERE}")
         if free < 2 * needed:
             rank_zero_warn(message)
+
+
+def _is_granted(folder: Path, size: int) -> bool:
+    """Whether the system lets a file of so many bytes be made in a folder; True where it cannot tell."""
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            os.posix_fallocate(file.fileno(), 0, size)
+    except OSError as error:
+        return error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    except AttributeError:  # not on macOS
+        pass
+    return True
 
 
 def compile_network(network: GridProcessor, grid: Tensor) -> bool:

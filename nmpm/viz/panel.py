@@ -57,6 +57,7 @@ class PanelRenderer:
         self._scale = SUPERSAMPLING * width / self.camera.width
         self._spacing = particle_spacing(trajectories.fullest_frame)
         diameter = float(np.clip(DISC_DIAMETER * self._spacing * width / self.camera.width, *DIAMETER_LIMITS))
+        diameter = min(diameter, 0.9 * min(width, self.height))  # a whole disc fits into the panel of an oblong box
         self._disc = _disc_offsets(SUPERSAMPLING * diameter / 2)
         colours = material_colours(trajectories.materials)
         materials = np.array([colours[name] for name in trajectories.material.tolist()], dtype=np.uint8)

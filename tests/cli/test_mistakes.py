@@ -15,8 +15,15 @@ from pathlib import Path
 import pytest
 
 from nmpm import EmulatorModule, EmulatorRecipe, TrajectoryDataModule
-from nmpm.cli import COMMANDS, main
+from nmpm._support.shipped import user_home
+from nmpm.cli import COMMANDS, expand_home, main
 from nmpm.cli.early_checks import PARTS, argument_names, class_names
+from nmpm.cli.training import forget_unused_slurm
+from nmpm.errors import ConfigError, DataError
+from nmpm.training.checkpoints import AtomicCheckpointIO
+from nmpm.training.preflight import check_disk
+from tests.scenes import box
+from tests.trainings import TINY, trainer_of
 
 GOOP = ["fit", "--config", "goop.yaml"]
 
@@ -244,3 +251,64 @@ def test_the_names_that_are_checked_early_are_those_of_the_parts():
         public = {name for name, kind in vars(import_module(part)).items() if isinstance(kind, type)}
         defined = {name for name in public if vars(import_module(part))[name].__module__.startswith("nmpm.")}
         assert defined <= class_names(part), part
+
+
+def test_without_a_home_folder_files_are_kept_with_the_temporary_ones(monkeypatch):
+    def fail(path):
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("NMPM_HOME", raising=False)
+    monkeypatch.setattr(Path, "expanduser", fail)
+    assert user_home() == Path(tempfile.gettempdir()) / f"nmpm-{os.getuid()}"
+
+
+@pytest.mark.parametrize(
+    ("word", "read"),
+    [
+        ("~/a", "/home/me/a"), ("--out=~/a", "/home/me/a"), ("--data.path=~", "/home/me"), ("a~", "a~"),
+        ("--about=see ~/a", None), ("~5 cells", "~5 cells"), ("runs/~", "runs/~"),
+    ],
+)  # fmt: skip
+def test_the_home_folder_is_known_at_the_beginning_of_a_path(word, read, monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    option = f"{word.partition('=')[0]}=" if word.startswith("--") else ""
+    assert expand_home(word) == (word if read is None else option + read)
+
+
+@pytest.mark.parametrize(
+    ("names", "kept"), [(["SLURM_STEP_ID"], True), ([], False), (["SLURM_STEP_ID", "SLURM_PTY_PORT"], False)]
+)
+def test_slurm_counts_where_srun_has_started_the_process(names, kept, monkeypatch):
+    for name in ("SLURM_STEP_ID", "SLURM_STEPID", "SLURM_PTY_PORT"):
+        monkeypatch.delenv(name, raising=False)
+    for name in ("SLURM_NTASKS", *names):
+        monkeypatch.setenv(name, "2")
+    forget_unused_slurm()
+    assert ("SLURM_NTASKS" in os.environ) == kept
+
+
+def test_a_quota_is_found_before_the_training(monkeypatch, tmp_path):
+    def refuse(*_):
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    trainer = trainer_of(tmp_path, 2)
+    module = EmulatorModule(box(), cells=8, processor=TINY)
+    check_disk(trainer, module)
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    with pytest.raises(ConfigError, match="your quota there, or the disk"):
+        check_disk(trainer, module)
+
+
+def test_a_checkpoint_that_a_full_disk_cuts_is_one_line_and_keeps_the_former_one(tmp_path, monkeypatch):
+    path = tmp_path / "last.ckpt"
+    AtomicCheckpointIO().save_checkpoint({"state_dict": {}}, path)
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise RuntimeError("[enforce fail at inline_container.cc:672] . unexpected pos 64 vs 0")
+
+    monkeypatch.setattr("nmpm.training.checkpoints.torch.save", fail)
+    with pytest.raises(DataError, match=r"last\.ckpt cannot be written: the disk, or your quota, is full"):
+        AtomicCheckpointIO().save_checkpoint({"state_dict": {}}, path)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]

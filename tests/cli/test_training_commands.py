@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -17,10 +18,11 @@ from nmpm._support.shipped import config_names, find_config
 from nmpm.cli import main
 from nmpm.cli.early_checks import argument_names
 from nmpm.cli.emulator_cli import EmulatorCLI
-from nmpm.data.format import Split
+from nmpm.data.format import Split, write_metadata, write_split
 from nmpm.errors import ConfigError
 from nmpm.training import EmulatorModule
 from nmpm.zoo import Zoo, publish
+from tests.made_up import made_up_metadata, made_up_trajectory
 
 TINY_GOOP = ["--data.generate", '{"counts": {"train": 2, "valid": 1, "test": 1}, "frames": 40}']
 IN_EACH_RUN = ("goop.yaml", "heatedchannel.yaml")
@@ -306,3 +308,80 @@ def test_a_model_of_a_field_is_tested_on_data_without_it(make_dataset):
     publish.add(Path(model), "hot", root="zoo")
     entry = Zoo.load("hot", root="zoo")
     assert entry.predict(entry.example(count=4), 3).fields["temperature"].shape == (1, 3, 4)
+
+
+def test_terminal_home_and_an_idle_slurm_job_end_no_training(make_dataset):
+    """Nothing can be printed, the terminal knows ASCII alone, nobody is at home, and srun was not used."""
+    words = ["fit", *WATERDROP, *source("waterdrop.yaml", make_dataset), "--trainer.default_root_dir=~/run"]
+    words += ["--model.cells", "8", "--trainer.enable_progress_bar", "true"]
+    environment = {name: value for name, value in os.environ.items() if name != "NMPM_HOME"}
+    environment |= {"HOME": str(Path("home").absolute()), "LC_ALL": "C", "PYTHONIOENCODING": "ascii"}
+    environment |= {"SLURM_JOB_ID": "1234", "SLURM_NTASKS": "4", "SLURM_JOB_NAME": "mine", "SLURM_PROCID": "0"}
+    with open("/dev/full", "w") as full:
+        run = subprocess.run(
+            [sys.executable, "-m", "nmpm", *words], stdout=full, stderr=subprocess.PIPE, text=True, env=environment
+        )
+    assert run.returncode == 0, run.stderr
+    assert "Traceback" not in run.stderr
+    assert Path("home/run/report.json").is_file()
+    assert Path("home/run/rollout.gif").is_file()
+    assert not Path("~").exists()
+    shown = subprocess.run(
+        [sys.executable, "-m", "nmpm", "test", "~/run"], capture_output=True, text=True, env=environment
+    )
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert "free fall" in shown.stdout
+
+
+def test_a_closed_pipe_ends_no_command_with_a_traceback():
+    listed = subprocess.Popen(
+        [sys.executable, "-m", "nmpm", "zoo", "list"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    listed.stdout.close()
+    assert listed.stderr.read() == b""
+    assert listed.wait() == 0
+
+
+def test_paths_of_a_configuration_may_begin_with_the_home_folder(make_dataset, monkeypatch):
+    monkeypatch.setenv("HOME", str(Path("home").absolute()))
+    make_dataset(train=((40, 9),) * 2, valid=((40, 9),), test=((40, 9),)).rename(Path("home").absolute())
+    Path("mine.yaml").write_text("trainer: {default_root_dir: ~/run}\ndata: {path: ~/}\n")
+    built = []
+    monkeypatch.setattr(EmulatorCLI, "_run_subcommand", lambda cli, _: built.append(cli))
+    assert main(["fit", *WATERDROP, "--config", "mine.yaml"]) == 0
+    assert built[0].run_folder.root == Path("home/run").absolute()
+    assert not Path("~").exists()
+
+
+def test_a_picture_that_cannot_be_drawn_is_a_warning(make_dataset, monkeypatch, capsys):
+    def fail(*_):
+        raise IndexError("index -9 is out of bounds")
+
+    monkeypatch.setattr("nmpm.training.callbacks.outputs.write_snapshots", fail)
+    words = [*WATERDROP, *source("waterdrop.yaml", make_dataset), "--trainer.default_root_dir", "run"]
+    with pytest.warns(UserWarning, match=r"^rollout.png is not drawn: index -9 is out of bounds$"):
+        assert main(["fit", *words, "--model.cells", "8"]) == 0
+    assert "written to run: report.json, errors.csv, rollout.gif\n" in capsys.readouterr().out
+
+
+def test_scenes_that_begin_empty_in_an_oblong_box_are_drawn(capsys):
+    runs = [made_up_trajectory(40, 60, seed) for seed in range(2)]
+    for run in runs:
+        run.position[:10] = np.nan
+        run.position[..., 0] *= 400
+    for split in ("train", "valid", "test"):
+        write_split(Path("late", f"{split}.h5"), runs)
+    write_metadata(Path("late"), made_up_metadata(bounds=((0.0, 400.0), (0.0, 1.0)), particle_volume=0.5))
+    words = [*WATERDROP, "--data.path", "late", "--trainer.default_root_dir", "run", "--model.cells", "[64, 8]"]
+    assert main(["fit", *words]) == 0
+    assert "written to run: report.json, errors.csv, rollout.png, rollout.gif\n" in capsys.readouterr().out
+
+
+def test_too_little_data_is_refused_at_once_unless_the_length_of_the_training_is_stated(make_dataset, capsys):
+    folder = make_dataset(train=((5, 10),), valid=((5, 10),), test=((5, 10),))
+    for start in ([], ["--start_from", "goop"]):
+        assert main(["fit", "--data.path", str(folder), *start]) == 1
+        said = capsys.readouterr().err
+        assert "5 frames of at most 10 particles to train on are 30 steps of particles" in said
+        assert "--trainer.max_time 00:00:15:00 trains on these anyway" in said
+    assert not Path("runs").exists()

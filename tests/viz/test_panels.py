@@ -45,6 +45,7 @@ def test_obstacles_and_wide_boxes_are_drawn(still):
     trajectories = still([[0.5, 0.5]], ["water"], obstacle=np.array([[0.2, 0.3]]))
     assert pixel(trajectories, draw(trajectories), [0.2, 0.3]) == OBSTACLE
     assert len(draw(still([[1, 1]], ["water"], bounds=((0, 4), (0, 2))), side=400)) == pytest.approx(200, abs=4)
+    assert draw(still([[9, 0.5], [500, 0.5]], ["water"] * 2, bounds=((0, 1000), (0, 1))), side=400).shape[1] == 400
 
 
 def test_particles_out_of_view_are_counted_and_not_drawn(falling):

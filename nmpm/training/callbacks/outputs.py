@@ -6,6 +6,7 @@ import json
 import platform
 import sys
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from copy import copy
 from pathlib import Path
@@ -22,6 +23,7 @@ from nmpm._support.atomic import atomic_write
 from nmpm._support.collectives import all_gather, gather_to_rank0, rank_and_world_size
 from nmpm._support.devices import device_name, join_hardware
 from nmpm._support.digests import float32_digest
+from nmpm._support.messages import one_line
 from nmpm._support.version import __version__
 from nmpm.data.format import Trajectory
 from nmpm.data.loading.evaluation import EvaluationLoader
@@ -112,11 +114,10 @@ class ReportWriter(Callback):
             Console().print(ensemble_table(f"{figures['dataset']}:", figures["ensemble"]))
         curves = {kind: values for kind, (_, values) in errors.items()}
         _write_curves(folder / "errors.csv", curves, pl_module.reading.every)
+        written = ["report.json", "errors.csv"]
         if self._first_rollout is not None:
-            trajectories = labelled_trajectories(pl_module.emulator.scene, *self._first_rollout)
-            write_snapshots(trajectories, folder / "rollout.png")
-            write_animation(trajectories, folder / "rollout.gif")
-        Console().print(f"written to {folder}: report.json, errors.csv, rollout.png, rollout.gif")
+            written += _draw(pl_module.emulator.scene, *self._first_rollout, folder)
+        Console().print(f"written to {folder}: {', '.join(written)}", soft_wrap=True)
 
     def report_untested(self, trainer: Trainer, module: EmulatorModule, reason: str) -> None:
         """Write and print the report of a training that ends without a test."""
@@ -184,7 +185,7 @@ def _gather_ranks(metric: MSE, order: Sequence[int]) -> tuple[list[dict[str, flo
 
 def _write_report(folder: Path, figures: Mapping[str, Any]) -> None:
     with atomic_write(folder / "report.json") as part:
-        part.write_text(json.dumps(figures, indent=1) + "\n")
+        part.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
 
 def _write_curves(path: Path, curves: Mapping[str, list[Tensor]], every: int) -> None:
@@ -196,7 +197,20 @@ def _write_curves(path: Path, curves: Mapping[str, list[Tensor]], every: int) ->
     means = torch.stack([torch.stack([curve[:frames] for curve in rows]).mean(0) for rows in curves.values()], dim=1)
     lines = [["frame", *curves], *([str(frame * every), *map(str, row)] for frame, row in enumerate(means.tolist(), 1))]
     with atomic_write(path) as part:
-        part.write_text("".join(",".join(line) + "\n" for line in lines))
+        part.write_text("".join(",".join(line) + "\n" for line in lines), encoding="utf-8")
+
+
+def _draw(scene: Scene, window: Window, predicted: Tensor, folder: Path) -> list[str]:
+    """Draw a picture and an animation of a rollout; names of the files, without one that cannot be drawn."""
+    written = []
+    for name in ("rollout.png", "rollout.gif"):
+        write = write_animation if name.endswith(".gif") else write_snapshots
+        try:
+            write(labelled_trajectories(scene, window, predicted), folder / name)
+            written.append(name)
+        except Exception as error:  # the results of a training are worth more than its pictures
+            warnings.warn(f"{name} is not drawn: {one_line(error) or type(error).__name__}", stacklevel=2)
+    return written
 
 
 def _logged(trainer: Trainer, prefix: str) -> dict[str, float]:
