@@ -40,7 +40,7 @@ def run(words: list[str]) -> None:
         "--data", required=True, metavar="DATASET", help="an embedded dataset (goop, …), or a file or folder of data"
     )
     add_scene_options(parser, "compare", scenes=6)
-    parser.set_defaults(config=None, predictors=[], members=None)
+    parser.set_defaults(times=True, config=None, predictors=[], members=None)
     options = parser.parse_args(words[1:])
     check_data("--data", Path(options.data))
     measure_and_report("compare", options, options.data)

@@ -28,7 +28,6 @@ from nmpm.training.checkpoints import COMPARED, read_checkpoint
 from nmpm.zoo.entries import load_checkpoint
 from nmpm.zoo.matching import match_data
 from nmpm.zoo.pretrained import Pretrained
-from nmpm.zoo.ranking import Ranking, Trial
 from nmpm.zoo.registry import load_model
 
 START_FROM = (
@@ -136,6 +135,8 @@ def _choose_materials(model: Pretrained, data: TrajectoryDataModule, given: Matc
     """The materials of recorded data by which a model predicts them best; None where they are not what is missing."""
     if given.materials is not None or not isinstance(data.data_source, FolderSource):
         return None
+    from nmpm.zoo.ranking import Ranking, Trial  # (the simulators compile kernels by numba)
+
     trial = Trial.of(Dataset(data.data_source))
     return Ranking(trial, stride=given.stride).best(model.name, model.emulator).stated
 

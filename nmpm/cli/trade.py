@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Mapping
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from nmpm._support.messages import counted
 from nmpm.cli.match_options import MatchOptions, add_match_options
 from nmpm.cli.options import (
     MODEL,
@@ -39,7 +42,8 @@ examples:
   nmpm trade goop --models goop runs/a runs/b   models of your own beside it
   nmpm trade goop --predictors mine:make        a predictor of another package: make(scene) gives it
   nmpm trade waterramps --members 8             ensembles of the models, judged by their fair CRPS
-  nmpm trade FOLDER --models runs/mine          recorded data of any form: without a simulator
+  nmpm trade FOLDER --models runs/mine          recorded data of any form: errors, and how long the rest takes
+  nmpm trade FOLDER --models runs/mine --times  ... and the rest: times, precisions, batches
   nmpm trade --print_config > sweep.yaml        what is measured; edit it, then:
   nmpm trade goop --config sweep.yaml
 
@@ -64,6 +68,7 @@ def run(words: list[str]) -> None:
     if options.config is not None:
         check_input("--config", options.config)
     check_data("DATASET", Path(options.dataset))
+    options.words = words
     measure_and_report("trade", options, options.dataset)
 
 
@@ -78,6 +83,10 @@ def _parser() -> argparse.ArgumentParser:
         help="predictors of other packages: the module is imported, and its code runs",
     )  # fmt: skip
     parser.add_argument("--config", type=Path, metavar="FILE", help="YAML of what is measured, see --print_config")
+    parser.add_argument(
+        "--times", action="store_true",
+        help="of recorded data, whose errors alone are measured first: times, too, and all forms of the models",
+    )  # fmt: skip
     parser.add_argument("--print_config", action="store_true", help="print the shipped sweep, and stop")
     parser.add_argument(
         "--members", type=int, metavar="M", help="also an ensemble of M rollouts of each model, and everybody's CRPS"
@@ -142,14 +151,33 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
         raise ConfigError("There is nothing to measure: give --models, or settings of the simulator.")
     for line in sweep.models.left_out(device) if models else []:
         sys.stdout.write(f"{line}\n")
-    points = trade.measure(choices, scenes, sweep, trade.Store(out), command)
+    store, rest = trade.Store(out), ""
+    errors_first = scenes.preset is None and not options.times and options.config is None and options.members is None
+    try:
+        if errors_first:
+            points = trade.measure_untimed(trade.first_forms(choices), scenes, sweep, store, command)
+            rest = _describe_rest(*trade.estimate_rest(choices, scenes, sweep, store), options.words)
+        else:
+            points = trade.measure(choices, scenes, sweep, store, command)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"interrupted; what is measured is in {out}, and the same command goes on.") from None
     console = Console()
-    shown = likely_points(points) if command == "trade" else points
+    shown = likely_points(points) if command == "trade" and not errors_first else points
     console.print(summary_table(shown, points, scenes))
     for line in report_lines(points):
         console.print(line, highlight=False, soft_wrap=True)
     paths = write_report(out, command, points, scenes, options.style and STYLES[options.style])
     sys.stderr.write(f"wrote {', '.join(map(str, paths))}\n")
+    sys.stdout.write(rest)
+
+
+def _describe_rest(count: int, seconds: float, words: list[str]) -> str:
+    """A line about what is not measured yet: how much, about how long it takes, and the command."""
+    time = timedelta(seconds=max(1, round(seconds)))
+    return (
+        f"next: times, and the models in other forms: {counted(count, 'measurement')}, about {time}\n"
+        f"  {shlex.join(['nmpm', *words, '--times'])}\n"
+    )
 
 
 def _check_materials(match: MatchOptions, models: Mapping[str, Pretrained]) -> None:

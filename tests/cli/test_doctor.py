@@ -12,7 +12,7 @@ from nmpm.zoo.verification import Check
 
 def test_the_report_is_complete_without_paths_of_the_home_and_passes(monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("NMPM_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "cache" / "zoo").mkdir(parents=True)
     (tmp_path / "cache" / "zoo" / "weights").write_bytes(bytes(3_000_000))
     assert main(["doctor"]) == 0

@@ -1,8 +1,11 @@
 import json
+import re
+import shlex
 
 from nmpm.cli import main
 from nmpm.cli.trade import _models_of
-from nmpm.evaluation.trade import shipped_sweep_text
+from nmpm.data.loading.sources import FolderSource
+from nmpm.evaluation.trade import read_scenes, shipped_sweep_text
 from nmpm.zoo import Pretrained, load_model
 from tests.evaluation.trade.made_up import SWEEP, tiny_emulator, tiny_scenes
 
@@ -72,3 +75,49 @@ def test_ensembles_stand_beside_one_rollout_in_time_and_crps(tmp_path, capsys, m
     assert ensemble["ms_per_frame"]["median"] > single["ms_per_frame"]["median"]
     assert main([*words, "--members", "0"]) == 1
     assert "--members" in capsys.readouterr().err
+
+
+def record(folder, name):
+    """Tiny scenes without their simulator, as recorded ones are."""
+    tiny_scenes(folder / name)
+    path = folder / name / "metadata.json"
+    content = json.loads(path.read_text())
+    path.write_text(json.dumps({key: value for key, value in content.items() if key != "simulation"}))
+    return folder / name
+
+
+def test_of_recordings_errors_come_first_then_how_long_the_rest_takes(tmp_path, capsys, monkeypatch):
+    data, out = record(tmp_path, "my data"), tmp_path / "out"
+    model = Pretrained(tiny_emulator(read_scenes("recorded", FolderSource(data), 2).scene), {})
+    monkeypatch.setattr("nmpm.zoo.load_model", lambda _: model)
+    monkeypatch.setattr("nmpm.evaluation.trade.shipped_sweep_text", lambda _: SWEEP)
+    words = ["trade", str(data), "--models", "goop", "--out", str(out)]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    table, rest = said.split("next: ")
+    assert "goop" in table
+    assert " ms " not in table
+    assert re.match(r"times, and the models in other forms: 10 measurements, about 0:00:\d\d\n", rest)
+    assert {path.name for path in out.iterdir()} == {
+        "points", "trade.csv", "trade.json", "trade.md", "errors.png", "frames.png",
+    }  # fmt: skip
+    command = shlex.split(rest.splitlines()[1])
+    assert command == ["nmpm", *words, "--times"]
+    assert main(command[1:]) == 0
+    assert " ms " in capsys.readouterr().out
+    assert (out / "trade.png").is_file()
+    assert main(words) == 0
+    assert "forms: 0 measurements" in capsys.readouterr().out
+
+
+def test_an_interrupted_trade_keeps_what_is_measured(tmp_path, capsys, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    data, out = record(tmp_path, "recorded"), tmp_path / "out"
+    monkeypatch.setattr("nmpm.evaluation.comparison.free_fall", interrupt)
+    monkeypatch.setattr("nmpm.evaluation.trade.sweep.free_fall", interrupt)
+    assert main(["trade", str(data), "--models", "--out", str(out)]) == 130
+    assert f"interrupted; what is measured is in {out}, and the same command goes on." in capsys.readouterr().err
+    (stored,) = (out / "points").iterdir()
+    assert len(json.loads(stored.read_text())["values"]) == 2

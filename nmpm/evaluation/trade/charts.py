@@ -202,7 +202,8 @@ def draw_curves(path: Path, points: Sequence[Point], scenes: Scenes) -> None:
     )  # fmt: skip
     axes.set_ylim(bottom=1e-3)
     axes.grid(visible=True, color="0.92", lw=0.6)
-    axes.legend(frameon=False, fontsize="small")
+    if drawn:
+        axes.legend(frameon=False, fontsize="small")
     _save(figure, path)
 
 

@@ -104,6 +104,12 @@ class Choice(ABC):
         return position, recorded_energy_gain(scenes.scene, window, position)
 
 
+def first_forms(choices: Sequence[Choice]) -> list[Choice]:
+    """The choices without the further forms of each model: its other precisions, batches, runtimes, its members."""
+    first: dict[object, Choice] = {}
+    return [c for c in choices if c.kind is not Kind.MODEL or first.setdefault(c.settings["model"], c) is c]
+
+
 def digest(plain: Any) -> str:
     """A key of plain data: SHA-256 of its JSON, in short."""
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:20]

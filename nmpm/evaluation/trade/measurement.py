@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -69,6 +70,37 @@ def measure(choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store: Stor
     return [_point(*measured, scenes) for measured in zip(choices, rows, times, strict=True)]
 
 
+def measure_untimed(
+    choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store: Store, title: str = "trade"
+) -> list[Point]:
+    """As `measure`, errors alone."""
+    with progress_bar(title, len(choices) * len(scenes)) as step:
+        rows = [measure_accuracy(choice, scenes, sweep.measures, store, step) for choice in choices]
+    return [_point(choice, row, Times(), scenes) for choice, row in zip(choices, rows, strict=True)]
+
+
+def estimate_rest(choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store: Store) -> tuple[int, float]:
+    """How many measurements the store lacks, and about how many seconds they take, by those that it has.
+
+    Those of a model's further forms are taken to be as long as those of its first.
+    """
+    stored = [store.read("errors", _errors_key(choice, sweep.measures)) for choice in choices]
+    models = [str(choice.settings.get("model", choice.name)) for choice in choices]
+    seconds: dict[str, list[list[float]]] = {}
+    for model, rows in zip(models, stored, strict=True):
+        seconds.setdefault(model, []).extend(row["seconds"] for row in rows.values() if "seconds" in row)
+    frames = sum(scenes.frames(index) for index in range(len(scenes))) / len(scenes)
+    share, count, total = min(1.0, sweep.timing.frames / frames), 0, 0.0
+    for choice, model, rows in zip(choices, models, stored, strict=True):
+        predicting, measuring = np.quantile(seconds[model] or [[0.0, 0.0]], 0.25, axis=0).tolist()
+        lacking = len(set(scenes.digests) - rows.keys())
+        times = store.read("times", _times_key(choice, scenes, sweep.timing))
+        untimed = sum(str(turn) not in times for turn in range(sweep.timing.rounds))
+        count += lacking + untimed
+        total += lacking * (predicting + measuring) + untimed * choice.batch * share * predicting
+    return count, total
+
+
 def _point(choice: Choice, rows: Sequence[Mapping[str, Any]], times: Times, scenes: Scenes) -> Point:
     length = min(scenes.frames(index) for index in range(len(scenes)))
     names = dict.fromkeys(name for row in rows for name in row.get("errors", {}))
@@ -94,7 +126,7 @@ def measure_accuracy(
     choice: Choice, scenes: Scenes, measures: Measures, store: Store, step: Step
 ) -> list[dict[str, Any]]:
     """Rows of `_measure_scene`, computed where the store lacks them; calls `step` after every scene."""
-    key = {"choice": dict(choice.identity), "measures": measures.to_dict()}
+    key = _errors_key(choice, measures)
     stored = store.read("errors", key)
     for index, scene in enumerate(scenes.digests):
         if scene not in stored:
@@ -104,6 +136,10 @@ def measure_accuracy(
     return [stored[scene] for scene in scenes.digests]
 
 
+def _errors_key(choice: Choice, measures: Measures) -> dict[str, Any]:
+    return {"choice": dict(choice.identity), "measures": measures.to_dict()}
+
+
 def _measure_scene(choice: Choice, scenes: Scenes, index: int, measures: Measures) -> dict[str, Any]:
     """Errors by name, squared error of each frame and, of the first scene, the shown frames; or why it failed.
 
@@ -111,16 +147,19 @@ def _measure_scene(choice: Choice, scenes: Scenes, index: int, measures: Measure
     little-endian float32.
     """
     window = with_predicted(scenes.window([index]), choice.bundle)
+    start = time.monotonic()
     try:
         predicted, gain = choice.predict(scenes, index)
     except NmpmError as error:
         if is_machine_failure(error):
             raise
         return {"failed": one_line(error)}
+    predicting = time.monotonic() - start
     row: dict[str, Any] = {
         "errors": measure_errors(scenes.scene, window, predicted, measures),
         "curve": [float(f"{value:.5g}") for value in squared_errors(window, predicted).tolist()],
     }
+    row["seconds"] = [round(predicting, 3), round(time.monotonic() - start - predicting, 3)]  # to predict, to compare
     if reason := instability(gain):
         row["failed"] = reason
     if index == 0:

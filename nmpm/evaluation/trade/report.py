@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +33,9 @@ def write_report(
     """Write all files of the report into a folder, which is made if it is missing.
 
     These are NAME.csv, one row for each point and error; NAME.json, all figures of every scene; NAME.md, the table of
-    all points and the sentences; NAME.png, time and error, and for a style the same as SVG or PDF; errors.png and
-    frames.png, see `charts.py`. Pictures are left out where nothing is stable, and frames.png of scenes in one
-    dimension.
+    all points and the sentences; where times are measured NAME.png, time and error, and for a style the same as SVG or
+    PDF; errors.png and frames.png, see `charts.py`. Pictures are left out where nothing is stable, and frames.png of
+    scenes in one dimension.
     """
     folder.mkdir(parents=True, exist_ok=True)
     plain = json.dumps(describe(points, scenes), indent=1, ensure_ascii=False) + "\n"
@@ -45,15 +45,20 @@ def write_report(
             part.write_text(text, encoding="utf-8")
     paths = [folder / f"{name}.{suffix}" for suffix in texts]
     if measure_names(points):
-        pictures = {f"{name}.png": draw_chart, "errors.png": draw_curves}
+        pictures: dict[str, Callable[[Path, Sequence[Point], Scenes], None]] = {"errors.png": draw_curves}
+        pictures |= {f"{name}.png": draw_chart} if _timed(points) else {}
         pictures |= {"frames.png": draw_frames} if scenes.scene.dim > 1 else {}
         for file, draw in pictures.items():
             draw(folder / file, points, scenes)
         paths += [folder / file for file in pictures]
-        if style is not None:
+        if style is not None and _timed(points):
             draw_styled_chart(paths[-1].with_name(name + style.suffix), points, scenes, style)
             paths.append(paths[-1].with_name(name + style.suffix))
     return paths
+
+
+def _timed(points: Sequence[Point]) -> bool:
+    return any(point.times.milliseconds for point in points)
 
 
 def csv_text(points: Sequence[Point], scenes: Scenes) -> str:
@@ -180,7 +185,8 @@ def markdown_text(name: str, points: Sequence[Point], scenes: Scenes) -> str:
     lines = [" | ".join(cells) for cells in (headings, ["---", *["---:"] * (len(headings) - 1)], *rows)]
     table = "\n".join(f"| {line} |" for line in lines)
     sentences = "\n".join(f"- {line}" for line in report_lines(points))
-    return f"# {title}\n\n![Time and error]({name}.png)\n\n{table}\n\n{caption}\n\n{sentences}\n"
+    picture = f"![Time and error]({name}.png)" if _timed(points) else "![Errors](errors.png)"
+    return f"# {title}\n\n{picture}\n\n{table}\n\n{caption}\n\n{sentences}\n"
 
 
 def _summary(
@@ -198,14 +204,17 @@ def _summary(
         small = value != 0 and value < 1e-3 * 10.0**unit.exponent
         return unit.show(value, 1 if small else digits) if math.isfinite(value) else ""
 
+    def place(point: Point) -> tuple[bool, float]:
+        return point.kind is Kind.FLOOR, point.milliseconds if _timed(points) else point.mean("mse")
+
     rows = []
-    for point in sorted(shown, key=lambda point: (point.kind is Kind.FLOOR, point.milliseconds)):
+    for point in sorted(shown, key=place):
         one, height = ranks.get(point.name), point.mean("height")
         spread = f" ({show(one.low, 2)}–{show(one.high, 2)})" if one and one.low < one.high else ""
         rows.append(
             [
                 point.name + " *" * (one is not None and one.probability >= _LIKELY),
-                f"{point.milliseconds:.3g}" if math.isfinite(point.milliseconds) else "",
+                *([f"{point.milliseconds:.3g}" if math.isfinite(point.milliseconds) else ""] if _timed(points) else []),
                 *(show(point.mean(name), 2) for name in horizons),
                 show(point.mean("mse")) + spread,
                 *([f"{1e3 * point.mean('crps'):.3g}"] if crps else []),
@@ -216,11 +225,16 @@ def _summary(
     return (
         f"{scenes.name}: {len(scenes)} test scenes of {particles} particles",
         f"MSE{unit} of frames 1 to h. EMD{unit}: earth mover's distance in the last frame. Height: deviation of the"
-        " particles' mean height in the last frame. ms: per frame, median. *: perhaps in the Pareto set."
-        + " CRPS ×10⁻³: fair, of densities; of members ms is of all, MSE of the first."
-        * crps,
+        " particles' mean height in the last frame."
+        + " ms: per frame, median. *: perhaps in the Pareto set." * _timed(points)
+        + " CRPS ×10⁻³: fair, of densities; of members ms is of all, MSE of the first." * crps,
         [
-            *("choice", "ms", *(name.replace("mse", "MSE") for name in horizons), f"MSE@{frames} (95%)"),
+            *(
+                "choice",
+                *["ms"] * _timed(points),
+                *(name.replace("mse", "MSE") for name in horizons),
+                f"MSE@{frames} (95%)",
+            ),
             *(["CRPS"] if crps else []),
             *("EMD", "height"),
         ],
