@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -62,7 +63,9 @@ def run(words: list[str]) -> None:
     check_folder("DESTINATION", arguments.destination)
     for note in convert(arguments.source, arguments.destination, arguments.format, options, ids):
         sys.stdout.write(f"- {note}\n")
-    sys.stdout.write(f"wrote {arguments.destination}; to look at it: nmpm inspect {arguments.destination}\n")
+    sys.stdout.write(
+        f"wrote {arguments.destination}; to look at it: nmpm inspect {shlex.quote(str(arguments.destination))}\n"
+    )
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import dataclasses
 import os
+import shlex
 import sys
 import time
 import webbrowser
@@ -100,7 +101,9 @@ def run(words: list[str]) -> None:
     write_split(file, [predicted(model, options.model, model.scene, window.initial, rollout, window)])
     ViewerPage(read_labelled(Split(file))).write(page)
     shown = "opened in the browser" if options.open and _open(page) else "open it in a browser"
-    sys.stdout.write(f"wrote {page}: {shown}. The positions are in {file}: nmpm render {file} makes a film.\n")
+    sys.stdout.write(
+        f"wrote {page}: {shown}. The positions are in {file}: nmpm render {shlex.quote(str(file))} makes a film.\n"
+    )
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -26,7 +26,7 @@ from nmpm.cli.matched_run import MatchedRun, add_arguments, stored_scene
 from nmpm.cli.options import check_folder
 from nmpm.cli.run_folder import CHECKPOINTS, SAVERS, RunFolder, next_folder
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.data.inspection.quick import contradictions_warning
+from nmpm.data.inspection.quick import contradictions_warning, stated_options
 from nmpm.data.loading.sources import FolderSource
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.scene import Scene
@@ -237,7 +237,10 @@ class EmulatorCLI(LightningCLI):
             self._test_best_weights()
             if self.trainer.is_global_zero:
                 data = self.config[self.subcommand]["data"]
-                sys.stdout.write(self.run_folder.next_commands(str(data["path"] or data["name"] or "DATA")))
+                source = self.datamodule.data_source
+                path = source.folder if data["source"] == "hub" else data["path"]
+                facts = stated_options(source) if isinstance(source, FolderSource) else []
+                sys.stdout.write(self.run_folder.next_commands(str(path or data["name"] or "DATA"), facts))
         except SystemExit as ended:
             if not isinstance(ended.__context__, KeyboardInterrupt):
                 raise

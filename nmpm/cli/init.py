@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -65,7 +66,7 @@ def run(words: list[str]) -> None:
         raise ConfigError(f"{out} exists already: delete it, or choose another file with --out.")
     check_output("--out", out)
     _write(arguments.path, options, out, f"runs/{name}", arguments.minutes)
-    sys.stdout.write(f"wrote {out}; to train by it: nmpm fit --config {out}\n")
+    sys.stdout.write(f"wrote {out}; to train by it: nmpm fit --config {shlex.quote(str(out))}\n")
 
 
 def write_for_fit(path: Path, options: Options, root: Path, minutes: float) -> Path:

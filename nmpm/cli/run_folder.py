@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -118,9 +118,12 @@ class RunFolder:
             f" {', '.join(others) or 'none'}. {mend}"
         )
 
-    def next_commands(self, data: str) -> str:
-        """What to do with a run that has been trained on data, a name or a path: three commands, a line each."""
-        root, data = shlex.quote(str(self.root)), shlex.quote(data)
+    def next_commands(self, data: str, facts: Sequence[str] = ()) -> str:
+        """What to do with a run that has been trained on data, a name or a path: three commands, a line each.
+
+        `facts` are options by which the commands are told what the data lack.
+        """
+        root, data = shlex.quote(str(self.root)), shlex.join([data, *facts])
         commands = {
             f"nmpm rollout {root} --data {data}": "a test scene beside its prediction, to view and to render",
             f"nmpm trade {data} --models {root}": "its time and errors, beside the simulator's if there is one",

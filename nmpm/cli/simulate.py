@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -107,7 +108,7 @@ def _simulate(options: argparse.Namespace) -> None:
         sys.stdout.write(f"shard {shard} is in {out}; trajectories of other shards that are not there yet: {missing}\n")
         return
     sys.stdout.write(f"wrote {', '.join(f'{n} {s}' for s, n in counts.items() if n)} trajectories to {out}\n")
-    sys.stdout.write(f"to look at them: nmpm inspect {out}\n")
+    sys.stdout.write(f"to look at them: nmpm inspect {shlex.quote(str(out))}\n")
 
 
 def _check_preview(path: Path) -> None:

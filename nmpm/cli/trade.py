@@ -152,7 +152,10 @@ def measure_and_report(command: str, options: argparse.Namespace, dataset: str) 
     for line in sweep.models.left_out(device) if models else []:
         sys.stdout.write(f"{line}\n")
     store, rest = trade.Store(out), ""
-    errors_first = scenes.preset is None and not options.times and options.config is None and options.members is None
+    asked_for_all = options.times or options.config or options.members
+    errors_first = (
+        scenes.preset is None and not asked_for_all and trade.estimate_rest(choices, scenes, sweep, store)[0] > 0
+    )
     try:
         if errors_first:
             points = trade.measure_untimed(trade.first_forms(choices), scenes, sweep, store, command)

@@ -3,6 +3,8 @@
 import json
 import os
 import re
+import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +16,7 @@ import yaml
 from PIL import Image
 
 from nmpm._support.devices import computes_bfloat16
-from nmpm._support.shipped import config_names, find_config
+from nmpm._support.shipped import config_names, find_config, shipped_folder
 from nmpm.cli import main
 from nmpm.cli.early_checks import argument_names
 from nmpm.cli.emulator_cli import EmulatorCLI
@@ -385,3 +387,62 @@ def test_too_little_data_is_refused_at_once_unless_the_length_of_the_training_is
         assert "5 frames of at most 10 particles to train on are 30 steps of particles" in said
         assert "--trainer.max_time 00:00:15:00 trains on these anyway" in said
     assert not Path("runs").exists()
+
+
+FACTS = ["--data.gravity", "[0.0, -9.81]", "--data.boundary", "[wall, wall]"]
+PRINTING = {
+    "fit": [
+        "fit",
+        *WATERDROP,
+        "--data.path",
+        "my data",
+        *FACTS,
+        "--model.cells",
+        "8",
+        "--trainer.default_root_dir=my runs",
+    ],
+    "init": ["init", "my data", "--out", "my data.yaml"],
+    "convert": ["convert", "my data", "my copy"],
+    "simulate": [
+        "simulate",
+        "goop",
+        "--frames",
+        "3",
+        "--train",
+        "0",
+        "--valid",
+        "0",
+        "--test",
+        "1",
+        "--out",
+        "my goop",
+    ],
+    "rollout": ["rollout", "goop", "--frames", "3", "--particles", "30", "--out", "my rollout.h5"],
+    "zoo match": ["zoo", "match", "my data", "--root", "zoo"],
+}
+"""Commands that print further commands."""
+
+
+@pytest.mark.parametrize("words", PRINTING.values(), ids=PRINTING)
+def test_every_command_that_is_printed_runs(words, make_dataset, monkeypatch, capsys):
+    sizes = ((40, 9),) * 2
+    make_dataset(train=sizes, valid=sizes, test=sizes, gravity=None).rename("my data")
+    shutil.copytree(shipped_folder("zoo") / "goop", Path("zoo", "goop"))
+    sweep = "{scenes: 1, timing: {rounds: 1, frames: 4}, models: {precision: [float32], batch: [1]}}"
+    monkeypatch.setattr("nmpm.evaluation.trade.shipped_sweep_text", lambda _: sweep)
+    assert main(words) == 0
+    printed = printed_commands(capsys.readouterr().out)
+    assert printed
+    while printed:
+        command = ["mine" if word == "NAME" else word for word in printed.pop(0)]
+        if command[1:3] == ["zoo", "add"]:
+            command += ["--about", "Made up."]
+        tiny = TINY if command[1] == "fit" else []
+        assert main([*command[1:], *tiny]) == 0, command
+        printed += printed_commands(capsys.readouterr().out) if command[1] == "trade" else []
+
+
+def printed_commands(text: str) -> list[list[str]]:
+    """Commands at the end of a line, or before two spaces or a comma."""
+    lines = re.findall(r"(?:^ +|: +)(nmpm (?:[^\n, ]|,(?! )| (?! ))+)", text, re.MULTILINE)
+    return [shlex.split(line) for line in lines]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import replace
 
 import numpy as np
@@ -34,19 +35,23 @@ def contradictions_warning(source: FolderSource) -> str:
         return ""
     shown = [f"  - {one_line(f'{finding.kind}: {finding.sentence}', _WIDTH)}" for finding in findings[:_SHOWN]]
     more = f" (and {len(findings) - _SHOWN} more)" if len(findings) > _SHOWN else ""
-    command = " ".join(["nmpm inspect", str(source.path), *_stated_options(source)])
+    command = shlex.join(["nmpm", "inspect", str(source.path), *stated_options(source)])
     return "\n".join(["Warning: these data contradict themselves:", *shown, f"  All of it{more}: {command}", ""])
 
 
-def _stated_options(source: FolderSource) -> list[str]:
-    """The options of `nmpm inspect` by which it reads a dataset as this source does."""
+def stated_options(source: FolderSource) -> list[str]:
+    """The options by which `nmpm inspect`, `rollout` and `trade` read a dataset as this source does."""
     options = source.options
     stated = {
         "family": options.family,
         "axes": options.axes,
-        "gravity": options.gravity and ",".join(f"{value:g}" for value in options.gravity),
+        "gravity": options.gravity and ",".join(f"{value:.12g}" for value in options.gravity),
         "boundary": options.boundary and ",".join(options.boundary),
-        "bounds": options.bounds and ",".join(f"{low:g}:{high:g}" for low, high in options.bounds),
+        "bounds": options.bounds and ",".join(f"{low:.12g}:{high:.12g}" for low, high in options.bounds),
+        "fields": options.fields and ",".join(options.fields),
+        "prescribed": options.prescribed and ",".join(map(str, sorted(options.prescribed))),
+        "resample": options.resample,
+        "smooth": options.smooth,
     }
     return [f"--{name}={value}" for name, value in stated.items() if value]
 

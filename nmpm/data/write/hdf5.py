@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -48,7 +49,7 @@ class NativeHdf5(TrajectoryWriter):
                 step()
 
     def hint(self, path: Path) -> str:
-        return f"nmpm view {path}, or ParaView"
+        return f"nmpm view {shlex.quote(str(path))}, or ParaView"
 
 
 class VtkHdf(NativeHdf5):

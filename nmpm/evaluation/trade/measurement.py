@@ -95,7 +95,7 @@ def estimate_rest(choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store
         predicting, measuring = np.quantile(seconds[model] or [[0.0, 0.0]], 0.25, axis=0).tolist()
         lacking = len(set(scenes.digests) - rows.keys())
         times = store.read("times", _times_key(choice, scenes, sweep.timing))
-        untimed = sum(str(turn) not in times for turn in range(sweep.timing.rounds))
+        untimed = sum(str(turn) not in times for turn in range(sweep.timing.rounds)) * ("failed" not in times)
         count += lacking + untimed
         total += lacking * (predicting + measuring) + untimed * choice.batch * share * predicting
     return count, total

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import shlex
 import sys
 import time
 import warnings
@@ -273,5 +274,5 @@ class PredictionWriter(BasePredictionWriter):
             path = Path(trainer.default_root_dir) / "predictions.h5"
             predicted = dict(pair for rank in by_rank for pair in rank.items())
             write_viewable(path, [predicted[index] for index in sorted(predicted)])
-            sys.stdout.write(f"written to {path}; to draw them: nmpm render {path}\n")
+            sys.stdout.write(f"written to {path}; to draw them: nmpm render {shlex.quote(str(path))}\n")
         self._predicted = {}
