@@ -57,6 +57,7 @@ WARNINGS = (
     r"You're using the WeightAveraging callback, but loading a checkpoint outside",
     r"Be aware that when using `ckpt_path`, callbacks used to create the checkpoint",
     r"Precision .* is not supported by the model summary",
+    r"You have overridden `on_before_batch_transfer` in `LightningModule`",
 )
 """Lightning's warnings about what is meant to be so."""
 
