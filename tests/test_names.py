@@ -92,7 +92,7 @@ def test_names_in_strings_exist():
 
 
 def test_extras_that_messages_name_exist():
-    """Where nmpm is installed, from a clone too, pip adds an extra to it without looking for nmpm on an index."""
+    """No index has nmpm: extras are installed from a clone."""
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
     commands = [
         command
@@ -100,10 +100,16 @@ def test_extras_that_messages_name_exist():
         for text in texts(tree)
         for command in re.findall(r"pip install[^:;(]*", text)
     ]
-    named = {extra for command in commands for extra in re.findall(r"\"nmpm\[(\w+)\]\"", command)}
-    assert named
-    assert named <= set(project["optional-dependencies"])
-    assert not [command for command in commands if re.search(r"(?<!\")nmpm", command)]  # none is on an index
+    written = {extra for command in commands for extra in re.findall(r"\"\.\[(\w+)\]\"", command)}
+    called = {
+        node.args[0].value
+        for tree in TREES.values()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "install"
+    }
+    assert called
+    assert written | called <= set(project["optional-dependencies"])
+    assert not [command for command in commands if "nmpm[" in command]
 
 
 def test_wrong_names_are_noticed():

@@ -154,20 +154,27 @@ def _compress(values: np.ndarray, rows: int) -> bytes:
         values = np.concatenate([values, np.zeros((rows - len(values), *values.shape[1:]), values.dtype)])
     octets = np.ascontiguousarray(values).reshape(-1).view(np.uint8).reshape(-1, values.itemsize)
     planes = [plane.tobytes() for plane in octets.T]
-    end = zlib.compressobj(_LEVEL, wbits=-zlib.MAX_WBITS).flush()
+    end = _deflate_stream(_LEVEL).flush()
     checksum = zlib.adler32(b"".join(planes)).to_bytes(4, "big")
     return b"".join((_ZLIB_HEADER, *map(_deflate, planes), end, checksum))
+
+
+def _deflate_stream(level: int) -> zlib._Compress:
+    return zlib.compressobj(level, wbits=-zlib.MAX_WBITS)
 
 
 def _deflate(plane: bytes) -> bytes:
     """Blocks of a deflate stream, which others may follow; bytes that look like noise, as low ones of floats, as are.
 
-    These take most of the time of compressing all, and make nothing smaller.
+    These take most of the time of compressing all, and make nothing smaller. Zeros at the end are compressed.
     """
-    sample = plane[:_SAMPLE]
+    filled = plane.rstrip(b"\0")
+    sample = filled[:_SAMPLE]
     level = 0 if len(zlib.compress(sample, _LEVEL)) > _NOISE * len(sample) else _LEVEL
-    stream = zlib.compressobj(level, wbits=-zlib.MAX_WBITS)
-    return stream.compress(plane) + stream.flush(zlib.Z_FULL_FLUSH)
+    blocks = b""
+    for part, stream in ((filled, _deflate_stream(level)), (plane[len(filled) :], _deflate_stream(_LEVEL))):
+        blocks += stream.compress(part) + stream.flush(zlib.Z_FULL_FLUSH)
+    return blocks
 
 
 @contextmanager

@@ -35,7 +35,7 @@ class ArrayFiles(RunFiles):
     """Files of arrays: positions (T, N, D) or (R, T, N, D), and whatever fits them."""
 
     name: ClassVar[str] = "arrays"
-    summary: ClassVar[str] = "positions (T, N, D) or (R, T, N, D) in .npz, .npy, .h5, .hdf5, .mat, by usual names"
+    summary: ClassVar[str] = "positions (T, N, D) or (R, T, N, D) in .npz, .npy, .h5, .mat, by usual names"
     patterns: tuple[str, ...] = ("*.npz", "*.npy", "*.h5", "*.hdf5", "*.mat")
 
     def recognises(self, path: Path) -> bool:

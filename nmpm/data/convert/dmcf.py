@@ -35,7 +35,7 @@ class Dmcf(FileFormat):
     """A file per trajectory; particle type 0 is the fluid, type 1 the solid boundary."""
 
     name: ClassVar[str] = "dmcf"
-    summary: ClassVar[str] = f"DMCF's *.msgpack.zst files (needs: {install('convert')})"
+    summary: ClassVar[str] = "DMCF's *.msgpack.zst files (extra convert)"
     pattern: ClassVar[str] = "*.msgpack.zst"
     family: ClassVar[str] = "lagrangebench"
     assumed: ClassVar[frozenset[str]] = frozenset({"dt", "gravity"})

@@ -28,7 +28,7 @@ class Gsd(FrameFormat):
     """Files of many frames; what a frame lacks is that of the first."""
 
     name: ClassVar[str] = "gsd"
-    summary: ClassVar[str] = f"GSD of HOOMD-blue (.gsd; needs: {install('gsd')})"
+    summary: ClassVar[str] = "GSD of HOOMD-blue (.gsd; extra gsd)"
     patterns: tuple[str, ...] = ("*.gsd",)
 
     def frames(self, file: Path) -> Iterator[Frame]:

@@ -25,7 +25,7 @@ class Ply(FrameFormat):
     """The element `vertex` of PLY files; a comment such as `time 0.5` states the time."""
 
     name: ClassVar[str] = "ply"
-    summary: ClassVar[str] = f"PLY files of points, a file per frame (needs: {install('vtk')})"
+    summary: ClassVar[str] = "PLY files of points, a file per frame (extra vtk)"
     patterns: tuple[str, ...] = ("*.ply",)
     signature: ClassVar[bytes] = b"ply"
 

@@ -25,7 +25,7 @@ class Vtk(FrameFormat):
     """A file per frame; or a `.pvd` or ParaView's `.series` that lists the files of a run with their times."""
 
     name: ClassVar[str] = "vtk"
-    summary: ClassVar[str] = f"VTK's .vtk, .vtp, .vtu, a file per frame, or .pvd, .series (needs: {install('vtk')})"
+    summary: ClassVar[str] = "VTK's .vtk, .vtp, .vtu, a file per frame, or .pvd, .series (extra vtk)"
     patterns: tuple[str, ...] = ("*.pvd", "*.series", "*.vtp", "*.vtu", "*.vtk")
     listings: ClassVar[tuple[str, ...]] = ("*.pvd", "*.series")
 
