@@ -64,9 +64,9 @@ def test_an_entry_that_states_other_errors_fails_from_the_shell(goop, capsys):
     (goop / "scenes.csv").write_text("\n".join([first, ",".join(cells), *rows[1:]]))
     assert main(words) == 1
     out = capsys.readouterr().out
-    assert "FAIL  test mse@100, as the mean over 30 test scenes" in out
+    assert "FAIL  test mse@100, as the mean over 30 test scenes of scenes.csv" in out
     assert "FAIL  test mse@8, as the mean" in out
-    assert "FAIL  test scene 0, mse@8" in out
+    assert "FAIL  test scene 0, rolled out: mse@8" in out
     assert "3 figures are not confirmed" in out
 
 
