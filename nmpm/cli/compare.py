@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
-from nmpm.cli.options import MODEL, HelpFormatter, check_data
+from nmpm.cli.options import MODEL, CommandParser, check_data
 from nmpm.cli.trade import add_scene_options, measure_and_report
 
 DESCRIPTION = """Compare models on test scenes that they need not have been trained on: other particle counts, other
@@ -32,9 +31,7 @@ cannot be matched.
 
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["compare", "waterramps", "--data", "waterdrop-xl"]."""
-    parser = argparse.ArgumentParser(
-        prog="nmpm compare", description=DESCRIPTION, epilog=_EXAMPLES, formatter_class=HelpFormatter
-    )
+    parser = CommandParser(prog="nmpm compare", description=DESCRIPTION, epilog=_EXAMPLES)
     parser.add_argument("models", nargs="+", metavar="MODEL", help=MODEL)
     parser.add_argument(
         "--data", required=True, metavar="DATASET", help="an embedded dataset (goop, …), or a file or folder of data"

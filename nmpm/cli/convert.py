@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nmpm.cli.options import (
-    HelpFormatter,
+    CommandParser,
     add_data_options,
     check_at_least,
     check_folder,
@@ -75,11 +75,8 @@ def _parser() -> argparse.ArgumentParser:
 
     width = max(len(kind.name) for kind in FORMATS)
     formats = "\n".join(f"  {f.name:<{width}}  {f.summary}" for f in FORMATS)
-    parser = argparse.ArgumentParser(
-        prog="nmpm convert",
-        description=_DESCRIPTION.format(formats=formats, suffixes=SUFFIXES),
-        epilog=_EXAMPLES,
-        formatter_class=HelpFormatter,
+    parser = CommandParser(
+        prog="nmpm convert", description=_DESCRIPTION.format(formats=formats, suffixes=SUFFIXES), epilog=_EXAMPLES
     )
     parser.add_argument("source", type=Path, help="file or folder to read")
     parser.add_argument(

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from nmpm.cli.options import (
     MODEL,
-    HelpFormatter,
+    CommandParser,
     add_device_option,
     check_at_least,
     check_device,
@@ -107,12 +107,11 @@ def run(words: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="nmpm demo",
         description="Draw a scene as those that a model learned from, simulate it, emulate it, print both times and the"
         " error, and show both in a browser.",
         epilog=_EXAMPLES,
-        formatter_class=HelpFormatter,
     )
     parser.add_argument("model", nargs="?", default=DEFAULT, help=f"{MODEL} (default: {DEFAULT})")
     parser.add_argument("--seed", type=int, default=0, help="of the scene (default: 0)")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import time
@@ -10,7 +9,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 from nmpm.cli.doctor_facts import Fact, collect, sections
-from nmpm.cli.options import HelpFormatter, add_device_option, check_device
+from nmpm.cli.options import CommandParser, add_device_option, check_device
 
 _DESCRIPTION = """\
 Print versions, processor, memory, GPU and caches, and test that this machine computes what it should: a simulation and
@@ -30,9 +29,7 @@ WIDTH = 14
 
 def run(words: list[str]) -> int:
     """Run the command, e.g. ["doctor"]; the exit status."""
-    parser = argparse.ArgumentParser(
-        prog="nmpm doctor", description=_DESCRIPTION, epilog=_EXAMPLES, formatter_class=HelpFormatter
-    )
+    parser = CommandParser(prog="nmpm doctor", description=_DESCRIPTION, epilog=_EXAMPLES)
     add_device_option(parser, "where to test: ")
     device = parser.parse_args(words[1:]).device
     if device != "cpu":  # imports torch, which may be what is broken

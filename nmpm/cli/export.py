@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nmpm.cli.options import (
-    HelpFormatter,
+    CommandParser,
     add_device_option,
     add_model_options,
     check_device,
@@ -56,9 +56,7 @@ def run(words: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="nmpm export", description=DESCRIPTION, epilog=_EXAMPLES, formatter_class=HelpFormatter
-    )
+    parser = CommandParser(prog="nmpm export", description=DESCRIPTION, epilog=_EXAMPLES)
     add_model_options(parser)
     add_device_option(parser)
     parser.add_argument("--format", choices=["onnx", "pt2"], default="onnx", help="of the file (default: onnx)")

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.options import HelpFormatter, add_data_options, check_exists, check_output, data_options
+from nmpm.cli.options import CommandParser, add_data_options, check_exists, check_output, data_options
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -42,9 +41,7 @@ _SHOWN = ("max_steps:", "cells:", "constraints:", "gravity:", "# dt ")
 
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["init", "grains"]."""
-    parser = argparse.ArgumentParser(
-        prog="nmpm init", description=_DESCRIPTION, epilog=_EXAMPLES, formatter_class=HelpFormatter
-    )
+    parser = CommandParser(prog="nmpm init", description=_DESCRIPTION, epilog=_EXAMPLES)
     parser.add_argument("path", type=Path, help="a dataset, of any format that nmpm convert reads")
     parser.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: NAME.yaml)")
     parser.add_argument("--minutes", type=float, default=MINUTES, help="of the training (default: 15)")

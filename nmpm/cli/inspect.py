@@ -12,7 +12,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.options import HelpFormatter, add_data_options, check_at_least, check_picture, data_options
+from nmpm.cli.options import CommandParser, add_data_options, check_at_least, check_picture, data_options
 from nmpm.errors import ConfigError, DataError, NmpmError
 
 if TYPE_CHECKING:
@@ -39,11 +39,10 @@ examples:
 
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["inspect", "ramps"]."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="nmpm inspect",
         description="Summarise a dataset on one screen, what contradicts itself first, and draw its first trajectory.",
         epilog=_EXAMPLES,
-        formatter_class=HelpFormatter,
     )
     parser.add_argument("path", type=Path, help="a dataset, of any format that nmpm convert reads")
     parser.add_argument("--format", metavar="NAME", help="format of the dataset (default: detected)")

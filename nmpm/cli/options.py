@@ -7,7 +7,7 @@ import dataclasses
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from nmpm._support.atomic import file_obstacle, folder_obstacle, name_obstacle
 from nmpm._support.devices import check_device_name, find_device
@@ -26,8 +26,24 @@ MODEL = (
 """Help for arguments that `nmpm.zoo.load_model` takes."""
 
 
+_TYPES = {int: "INTEGER", float: "NUMBER", Path: "PATH"}
+"""What stands for a value of an option in the help."""
+
+
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Fills prose to the terminal's width; paragraphs with indented lines, as examples are, stay as written."""
+    """Help with types and defaults of options, and with prose filled to the terminal's width.
+
+    Paragraphs with indented lines, as examples are, stay as written.
+    """
+
+    def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
+        return _TYPES.get(action.type) or super()._get_default_metavar_for_optional(action)  # type: ignore[arg-type]
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        text = action.help or ""
+        if not action.option_strings or "default" in text or action.default in (None, False, argparse.SUPPRESS, [], ""):
+            return text
+        return f"{text} (default: %(default)s)"
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         paragraphs = text.strip("\n").split("\n\n")
@@ -36,6 +52,16 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
             for paragraph in paragraphs
         ]
         return textwrap.indent("\n\n".join(filled), indent) + "\n"
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A command's parser; an error is one line, and says where the options are."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **{"formatter_class": HelpFormatter} | options)
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}. See {self.prog} --help.\n")
 
 
 def add_model_options(parser: argparse.ArgumentParser, default: str | None = None) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from nmpm._support.messages import install
 from nmpm.cli.options import (
-    HelpFormatter,
+    CommandParser,
     add_device_option,
     add_model_options,
     add_runtime_option,
@@ -71,11 +71,10 @@ def run(words: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="nmpm play",
         description="Play with a trained model in a browser: throw and pour material, drag obstacles, turn gravity.",
         epilog=_EXAMPLES,
-        formatter_class=HelpFormatter,
     )
     add_model_options(parser, default=DEFAULT)
     add_device_option(parser)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
 from nmpm._support.messages import install
-from nmpm.cli.options import HelpFormatter, add_split_option, add_style_option, check_exists, derived_name
+from nmpm.cli.options import CommandParser, add_split_option, add_style_option, check_exists, derived_name
 from nmpm.errors import ConfigError
 
 _EXAMPLES = """\
@@ -22,12 +21,11 @@ examples:
 
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["render", "out.h5"]."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="nmpm render",
         description="Draw a trajectory, or two beside each other: PNG, and GIF or MP4. Of a rollout with --members it"
         " draws one over the share of members that are at each place, and bands of height, front and energy.",
         epilog=_EXAMPLES,
-        formatter_class=HelpFormatter,
     )
     parser.add_argument("file", type=Path, help="a rollout, or data of any format that nmpm inspect reads")
     parser.add_argument("truth", type=Path, nargs="?", help="what FILE should be; errors are against it")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from nmpm._support.shipped import find_preset
 from nmpm.cli.match_options import MatchOptions, add_match_options
 from nmpm.cli.options import (
-    HelpFormatter,
+    CommandParser,
     add_data_options,
     add_device_option,
     add_model_options,
@@ -169,12 +169,11 @@ def _optimized(model: Pretrained, options: argparse.Namespace) -> Pretrained:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="nmpm rollout",
         description="Roll a trained model out: in a scene as those of its training, from thrown blocks of particles, or"
         " from a recorded trajectory.",
         epilog=_EXAMPLES,
-        formatter_class=HelpFormatter,
     )
     add_model_options(parser)
     add_device_option(parser)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nmpm._support.shipped import find_preset
-from nmpm.cli.options import HelpFormatter, check_at_least, check_folder, check_picture
+from nmpm.cli.options import CommandParser, check_at_least, check_folder, check_picture
 
 if TYPE_CHECKING:
     from nmpm.sim import Preset
@@ -39,11 +39,10 @@ def run(words: list[str]) -> None:
     """
     from nmpm.data.write import SUFFIXES
 
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="nmpm simulate",
         description="Simulate a dataset of a shipped scene or your own, ready for training.",
         epilog=_EXAMPLES,
-        formatter_class=HelpFormatter,
     )
     parser.add_argument("name", nargs="?", help="a shipped scene, or a YAML file")
     parser.add_argument("--list", action="store_true", help="list the shipped scenes")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from nmpm._support.shipped import find_preset
 from nmpm.cli.match_options import MatchOptions, add_match_options, describe
 from nmpm.cli.options import (
-    HelpFormatter,
+    CommandParser,
     add_device_option,
     add_model_options,
     add_runtime_option,
@@ -70,9 +70,7 @@ def run(words: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="nmpm stress", description=DESCRIPTION, epilog=_EXAMPLES, formatter_class=HelpFormatter
-    )
+    parser = CommandParser(prog="nmpm stress", description=DESCRIPTION, epilog=_EXAMPLES)
     add_model_options(parser)
     add_device_option(parser)
     add_threads_option(parser)

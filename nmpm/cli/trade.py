@@ -14,7 +14,7 @@ from nmpm._support.messages import counted
 from nmpm.cli.match_options import MatchOptions, add_match_options
 from nmpm.cli.options import (
     MODEL,
-    HelpFormatter,
+    CommandParser,
     add_data_options,
     add_device_option,
     add_style_option,
@@ -73,9 +73,7 @@ def run(words: list[str]) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="nmpm trade", description=DESCRIPTION, epilog=_EXAMPLES, formatter_class=HelpFormatter
-    )
+    parser = CommandParser(prog="nmpm trade", description=DESCRIPTION, epilog=_EXAMPLES)
     parser.add_argument("dataset", nargs="?", help="an embedded dataset (goop, …), or a file or folder of data")
     parser.add_argument("--models", nargs="*", metavar="MODEL", help=f"{MODEL} (default: the zoo's of this dataset)")
     parser.add_argument(

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
-from nmpm.cli.options import HelpFormatter, add_split_option, check_at_least, check_exists, derived_name
+from nmpm.cli.options import CommandParser, add_split_option, check_at_least, check_exists, derived_name
 
 _EXAMPLES = """\
 examples:
@@ -21,12 +20,11 @@ The page needs no network and no nmpm: send it to anybody. Space plays, ? shows 
 
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["view", "out.h5", "truth.h5"]."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="nmpm view",
         description="Write a self-contained HTML page that plays a trajectory, or two beside each other. Of a rollout"
         " with --members it shows all members: faint, as density, or one by one, and bands of height, front, energy.",
         epilog=_EXAMPLES,
-        formatter_class=HelpFormatter,
     )
     parser.add_argument("file", type=Path, help="a rollout, or data of any format that nmpm inspect reads")
     parser.add_argument("truth", type=Path, nargs="?", help="what FILE should be; errors are against it")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from nmpm._support.messages import one_line
 from nmpm.cli import zoo_match
-from nmpm.cli.options import HelpFormatter, add_device_option, check_device, check_model
+from nmpm.cli.options import CommandParser, add_device_option, check_device, check_model
 
 _ROOT = "folder of another zoo (default: your own, NMPM_HOME/zoo or ~/.cache/nmpm/zoo, and the shipped one)"
 _MODEL = "name, an entry's folder, or owner/repository@revision of the hub"
@@ -37,9 +37,7 @@ def run(words: list[str]) -> int | None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="nmpm zoo", description="The pretrained models.", epilog=_EXAMPLES, formatter_class=HelpFormatter
-    )
+    parser = CommandParser(prog="nmpm zoo", description="The pretrained models.", epilog=_EXAMPLES)
     parser.add_argument("--root", type=Path, help=_ROOT)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 

@@ -39,7 +39,9 @@ def self_test(device: str = "cpu") -> Iterator[Check]:
     losses = training_losses(model.scene, scene.pick_frames(slice(FIRST, None)), device)
     for step, stated, measured in zip((1, STEPS), LOSSES, (losses[0], losses[-1]), strict=True):
         bounds = ((1 - RELATIVE) * stated, (1 + RELATIVE) * stated)
-        yield Check(f"training of {STEPS} steps, run: loss of step {step}", stated, measured, *bounds, stated_by="it should be")
+        yield Check(
+            f"training of {STEPS} steps, run: loss of step {step}", stated, measured, *bounds, stated_by="it should be"
+        )
 
 
 def training_losses(scene: Scene, window: Window, device: str) -> list[float]:

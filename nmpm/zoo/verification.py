@@ -96,7 +96,9 @@ def verify(model: Pretrained, rows: Rows, full: bool = False, data: Path | None 
         ZooError: if the card is malformed, or nothing is stated of the test scenes that can be measured.
     """
     distance = golden_distance(model, model.card.get("golden"))
-    yield Check(f"golden rollout of {FRAMES} frames, repeated: largest distance in cells", 0.0, distance, 0.0, TOLERANCE)
+    yield Check(
+        f"golden rollout of {FRAMES} frames, repeated: largest distance in cells", 0.0, distance, 0.0, TOLERANCE
+    )
     yield from _headline(model, rows)
     frames, count = (None, len(rows)) if full else (SHORT_FRAMES, SHORT_SCENES)
     metric = MSE()
