@@ -12,6 +12,7 @@ import pytest
 
 from nmpm import Zoo
 from nmpm._support.messages import install
+from tests.conftest import wait_until
 
 ROOT = Path(__file__).parent.parent
 PAGES = [
@@ -127,3 +128,29 @@ def test_links_are_rewritten_to_their_place_in_the_site(tmp_path):
     links = load_hook("links")
     assert links.site_path(ROOT / "docs" / "howto" / "stress.md", ROOT / "docs") == "howto/stress.md"
     assert links.site_path(ROOT / "zoo" / "README.md", ROOT / "docs") == "zoo/README.md"
+
+
+def test_players_of_the_gallery_are_loaded_in_view_and_released_outside(browser, tmp_path):
+    """A browser drops the oldest of more than 16 contexts of WebGL: the page of 18 models had two that were black."""
+    gallery = load_hook("gallery")
+    names = [f"model{number}" for number in range(20)]
+    (tmp_path / "gallery").mkdir()
+    player = gallery.player("goop/fast", 4)
+    for name in names:
+        (tmp_path / "gallery" / f"{name}.html").write_text(player, "utf-8")
+    (tmp_path / "gallery.html").write_text(f"<style>iframe {{height: 26rem}}</style>{gallery.page(names)}", "utf-8")
+    page = browser.new_page(viewport={"width": 900, "height": 640})
+    lost = []
+    page.on("console", lambda message: lost.append(message.text) if "WebGL" in message.text else None)
+    page.goto((tmp_path / "gallery.html").as_uri())
+    for name in (*names, *names[::-1]):
+        place = page.locator(f"iframe[title={name}]")
+        place.scroll_into_view_if_needed()
+        wait_until(page, f"document.querySelector('iframe[title={name}]').src.endsWith('{name}.html')")
+        frame = place.element_handle().content_frame()
+        frame.wait_for_url(f"**/{name}.html")
+        wait_until(frame, "window.viewer && viewer.drawn > 0 && !viewer.drawing.gl.isContextLost()")
+        loaded = page.evaluate("document.querySelectorAll('iframe[src^=gallery]').length")
+        assert loaded <= 6
+    assert not [text for text in lost if "Too many active WebGL contexts" in text]
+    page.close()

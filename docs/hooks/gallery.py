@@ -10,6 +10,18 @@ from nmpm import Zoo
 from nmpm.viz import LabelledTrajectories
 from nmpm.viz.viewer import ViewerPage
 
+IN_VIEW = """\
+<script>
+{
+  const show = ({ isIntersecting, target }) => {
+    const wanted = isIntersecting ? target.dataset.src : "about:blank";
+    if (target.getAttribute("src") !== wanted) target.src = wanted;
+  };
+  const players = new IntersectionObserver((entries) => entries.forEach(show), { rootMargin: "200px" });
+  document.querySelectorAll("iframe.player").forEach((player) => players.observe(player));
+}
+</script>"""
+"""Loads players that are in view and unloads the others: browsers allow 16 contexts of WebGL, and a page has more."""
 VALUES = 500_000  # coordinates of a page, which then has about a megabyte
 
 
@@ -25,15 +37,15 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def page(names: list[str]) -> str:
     """The gallery, as Markdown."""
     parts = [
-        f"## {name}\n\n[Its card](zoo/{name}/README.md)\n\n"
-        f'<iframe src="gallery/{_file(name)}" title="{name}" loading="lazy" class="player"></iframe>'
+        f'## {name}\n\n[Its card](zoo/{name}/README.md); <a href="gallery/{_file(name)}">the player alone</a>\n\n'
+        f'<iframe data-src="gallery/{_file(name)}" title="{name}" class="player"></iframe>'
         for name in names
     ]
     head = (
         "# Gallery\n\nA rollout of each model, from a scene of its own kind that it has not seen; `nmpm demo NAME` sets"
         "\nthe simulator beside it, `nmpm play NAME` lets you interfere; one model [plays in your browser](play.md)."
     )
-    return "\n\n".join([head, *parts]) + "\n"
+    return "\n\n".join([head, *parts, IN_VIEW]) + "\n"
 
 
 def player(name: str, frames: int) -> str:

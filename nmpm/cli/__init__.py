@@ -70,13 +70,18 @@ A --config that is not a file in the working directory is looked up among the sh
 
 def usage() -> str:
     """The top-level help."""
+    import shutil
     import textwrap
 
     from nmpm._support.shipped import config_names
 
-    lines = [f"  {name:<10} {summary}" for name, (_, summary) in COMMANDS.items()]
+    width = max(40, shutil.get_terminal_size().columns)
+    lines = [
+        textwrap.fill(summary, width, initial_indent=f"  {name:<10} ", subsequent_indent=" " * 13)
+        for name, (_, summary) in COMMANDS.items()
+    ]
     configs = textwrap.fill(
-        ", ".join(config_names()), 98, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False
+        ", ".join(config_names()), width, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False
     )
     return USAGE.format(commands="\n".join(lines), configs=configs)
 
@@ -125,7 +130,8 @@ def _main(words: list[str]) -> int:
         sys.stderr.write(f"nmpm {words[0]}: {file}{error.strerror.lower()}.\n")
         return 1
     except KeyboardInterrupt as interrupt:
-        sys.stderr.write(f"\nnmpm {words[0]}: {interrupt or 'interrupted.'}\n")
+        line = "\r\x1b[K" if sys.stderr.isatty() else ""  # terminals show ^C there
+        sys.stderr.write(f"{line}nmpm {words[0]}: {str(interrupt) or 'interrupted.'}\n")
         return 130
 
 

@@ -17,12 +17,8 @@ from lightning.pytorch.cli import LightningArgumentParser
 
 from nmpm._support.messages import plain_warnings
 from nmpm._support.shipped import PACKAGE
-from nmpm.cli.early_checks import UsageError
-from nmpm.decoders import Decoder
-from nmpm.processors import Processor
-from nmpm.transfer import Transfer
+from nmpm.cli.early_checks import UsageError, nearest
 
-PARTS = {"processor": Processor, "transfer": Transfer, "decoder": Decoder}
 LONGEST = 300
 """Characters of a message of jsonargparse's that are shown."""
 
@@ -97,11 +93,11 @@ class BriefParser(LightningArgumentParser):
 def explain(message: str, names: Iterable[str]) -> str:
     """A message of jsonargparse in one line, with the nearest of `names`, the parser's, where one is unknown."""
     if match := re.match(r"unrecognized arguments: --([\w.]+)", message):
-        return f"there is no option --{match[1]}{_hint(match[1], names, '--')}"
+        return f"there is no option --{match[1]}{nearest(match[1], names, '--')}"
     if match := re.match(r"Subcommand '\w+' does not accept option '([\w.]+)'", message):
-        return f"the configuration has an unknown key {match[1]}{_hint(match[1], names, '')}"
+        return f"the configuration has an unknown key {match[1]}{nearest(match[1], names, '')}"
     if match := re.match(r"Option '([\w.]+)' is not accepted", message):
-        return f"the argument {match[1]} is unknown{_hint(match[1], names, '')}"
+        return f"the argument {match[1]} is unknown{nearest(match[1], names, '')}"
     key = re.match(r'Parser key "([\w.]+)":', message)
     option = f"--{key[1]}: " if key else ""
     if match := re.search(r"module '([\w.]+)' has no attribute '(\w+)'", message):
@@ -128,16 +124,3 @@ def is_of_other_packages(error: BaseException) -> bool:
         parts |= {Path(frame.filename) for frame in traceback.extract_tb(following.__traceback__)}
         following = following.__cause__ or following.__context__
     return not any(path.is_relative_to(PACKAGE) and not path.is_relative_to(PACKAGE / "cli") for path in parts)
-
-
-def _hint(wrong: str, names: Iterable[str], mark: str) -> str:
-    """A question for the nearest of the options, else for an argument of a part that is spelt like the last word."""
-    arguments = {
-        name: f"model.{part}.{name}"
-        for part, base in PARTS.items()
-        for kind in base.__subclasses__()
-        for name in vars(kind).get("__dataclass_fields__", ())
-    }
-    near = get_close_matches(wrong, list(names), n=1, cutoff=0.8)
-    near += [arguments[name] for name in get_close_matches(wrong.rpartition(".")[2], arguments, n=1, cutoff=0.75)]
-    return f"; did you mean {mark}{near[0]}?" if near else ". See --help_all for all there are."

@@ -57,6 +57,7 @@ def run(words: list[str]) -> None:
     for path in (file, page):
         check_output("--out", path)
     check_model(options.model)
+    _check_simulated(options.model)
     check_device(options.device)
     from nmpm._support.devices import device_name
     from nmpm._support.messages import counted
@@ -76,10 +77,7 @@ def run(words: list[str]) -> None:
     model = load_model(options.model, options.device)
     preset = training_preset(model)
     if preset is None:
-        raise ConfigError(
-            f"{options.model} was not trained on scenes of a shipped simulator, so there is none to set beside it."
-            f" nmpm rollout {options.model} shows what it predicts; nmpm demo {DEFAULT} has a simulator."
-        )
+        raise ConfigError(_no_simulator(options.model))
     choose_threads(model, 1)  # as many as the simulator's
     sys.stdout.write(f"Scene of {preset.name}, seed {options.seed}; simulator: {preset.generator}.\n")
     simulated, slow = _simulate(preset, options.seed, options.frames + 1)
@@ -104,6 +102,22 @@ def run(words: list[str]) -> None:
     sys.stdout.write(
         f"wrote {page}: {shown}. The positions are in {file}: nmpm render {shlex.quote(str(file))} makes a film.\n"
     )
+
+
+def _no_simulator(model: str) -> str:
+    return (
+        f"{model} was not trained on scenes of a shipped simulator, so there is none to set beside it."
+        f" nmpm rollout {model} shows what it predicts; nmpm demo {DEFAULT} has a simulator."
+    )
+
+
+def _check_simulated(name: str) -> None:
+    """Raise ConfigError, before torch is imported, for a model of the zoo whose card names no simulator."""
+    from nmpm.zoo.card import preset_of
+    from nmpm.zoo.registry import Zoo
+
+    if name in Zoo.list() and preset_of(Zoo.card(name)) is None:
+        raise ConfigError(_no_simulator(name))
 
 
 def _parser() -> argparse.ArgumentParser:

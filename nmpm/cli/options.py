@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from nmpm._support.atomic import file_obstacle, folder_obstacle, name_obstacle
 from nmpm._support.devices import check_device_name, find_device
-from nmpm._support.messages import suggestion
+from nmpm._support.messages import one_line, suggestion
 from nmpm._support.shipped import preset_names
 from nmpm.errors import ConfigError
 
@@ -37,7 +37,8 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
     """
 
     def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
-        return _TYPES.get(action.type) or super()._get_default_metavar_for_optional(action)  # type: ignore[arg-type]
+        named = _TYPES.get(action.type) if isinstance(action.type, type) else None
+        return named or super()._get_default_metavar_for_optional(action)
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         text = action.help or ""
@@ -115,6 +116,19 @@ def add_runtime_option(parser: argparse.ArgumentParser) -> None:
         help="what computes the network: eager (torch, default), openvino (CPU, the extra of that name), windows (for"
         " large scenes that are mostly empty), or auto for the faster of eager and openvino here",
     )
+
+
+RUNTIMES = ("auto", "openvino", "windows", "eager")
+"""Values of `--runtime`; `nmpm.emulator.runtimes`, which imports torch, has them."""
+
+
+def check_runtime(name: str) -> None:
+    """Raise ConfigError if a `--runtime` does not exist; former names are accepted."""
+    if name not in (*RUNTIMES, "cuda-graph", "triton"):
+        raise ConfigError(
+            f"No runtime is called {one_line(repr(name), 60)}; there are {', '.join(RUNTIMES)}."
+            f"{suggestion(name[:60], RUNTIMES)}"
+        )
 
 
 def add_out_option(parser: argparse.ArgumentParser, default: Path) -> None:

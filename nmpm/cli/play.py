@@ -17,6 +17,7 @@ from nmpm.cli.options import (
     check_at_least,
     check_device,
     check_model,
+    check_runtime,
     choose_threads,
 )
 from nmpm.data.write import find_writer
@@ -102,3 +103,4 @@ def _check(options: argparse.Namespace) -> None:
     find_writer("--out", options.out)
     check_model(options.model, options.root)
     check_device(options.device)
+    check_runtime(options.runtime)

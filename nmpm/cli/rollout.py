@@ -23,6 +23,7 @@ from nmpm.cli.options import (
     check_data,
     check_device,
     check_model,
+    check_runtime,
     choose_threads,
     data_options,
     find_data,
@@ -234,6 +235,7 @@ def _check(options: argparse.Namespace) -> None:
         find_preset(options.fallback)
     check_model(options.model, options.root)
     check_device(options.device)
+    check_runtime(options.runtime)
     match = MatchOptions.read(options.materials, options.stride, options.strict)
     data_options(options)
     if options.data is not None:

@@ -14,7 +14,6 @@ from nmpm.cli.options import CommandParser, check_at_least, check_folder, check_
 if TYPE_CHECKING:
     from nmpm.sim import Preset
 
-_INTERRUPTED = 130  # as shells report SIGINT
 
 _EXAMPLES = """\
 examples:
@@ -75,8 +74,7 @@ def run(words: list[str]) -> None:
         _simulate(options)
     except KeyboardInterrupt:
         kept = "nothing was written" if options.preview else "the same command continues after finished trajectories"
-        sys.stderr.write(f"nmpm simulate: interrupted; {kept}.\n")
-        raise SystemExit(_INTERRUPTED) from None
+        raise KeyboardInterrupt(f"interrupted; {kept}.") from None
 
 
 def _simulate(options: argparse.Namespace) -> None:

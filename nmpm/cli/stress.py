@@ -20,6 +20,7 @@ from nmpm.cli.options import (
     check_device,
     check_folder,
     check_model,
+    check_runtime,
     choose_threads,
 )
 from nmpm.errors import ConfigError
@@ -43,6 +44,12 @@ examples:
 """
 
 
+GROUP_NAMES = (
+    *("long", "settling", "speeds", "counts", "sizes", "precision", "sensitivity", "obstacles", "poison", "free"),
+)
+"""Groups of `nmpm.evaluation.stress`, which imports torch."""
+
+
 def run(words: list[str]) -> None:
     """Run the command, e.g. ["stress", "goop"]."""
     arguments = _parser().parse_args(words[1:])
@@ -51,19 +58,19 @@ def run(words: list[str]) -> None:
         find_preset(arguments.preset)
     check_model(arguments.model, arguments.root)
     check_device(arguments.device)
+    check_runtime(arguments.runtime)
     stated = MatchOptions.read(arguments.materials, arguments.stride, arguments.strict)
     if stated != MatchOptions() and not arguments.preset:
         raise ConfigError("--materials, --stride and --strict are about the scenes of a --preset: give it too.")
     if arguments.report is not None:
         check_folder("--report", arguments.report)
-    from nmpm.evaluation.stress import FULL, GROUPS, QUICK
+    if unknown := sorted(set(arguments.groups or ()) - set(GROUP_NAMES)):
+        raise ConfigError(f"--groups {' '.join(unknown)}: the groups are {', '.join(GROUP_NAMES)}.")
+    from nmpm.evaluation.stress import FULL, QUICK
 
-    unknown = sorted(set(arguments.groups or ()) - set(GROUPS))
-    if unknown:
-        raise ConfigError(f"--groups {' '.join(unknown)}: the groups are {', '.join(GROUPS)}.")
     model = _load(arguments, stated)
     start = time.monotonic()
-    results = _run_groups(model, FULL if arguments.full else QUICK, arguments.groups or list(GROUPS))
+    results = _run_groups(model, FULL if arguments.full else QUICK, arguments.groups or list(GROUP_NAMES))
     _print_report(model, results, "full" if arguments.full else "quick", time.monotonic() - start, arguments)
     if any(result.passed is False for result in results):
         raise SystemExit(1)
@@ -89,8 +96,7 @@ def _parser() -> argparse.ArgumentParser:
         "--groups",
         nargs="+",
         metavar="GROUP",
-        help="only these, of long, settling, speeds, counts, sizes, precision, sensitivity, obstacles, poison, free"
-        " (default: all)",
+        help=f"only these, of {', '.join(GROUP_NAMES)} (default: all)",
     )
     parser.add_argument("--seed", type=int, default=0, help="of the scenes (default: 0)")
     parser.add_argument("--json", action="store_true", help="print JSON, and no table")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import os
 import re
+import shutil
 import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,7 +26,7 @@ from nmpm.cli.early_checks import (
     SIGNATURES,
     Option,
     UsageError,
-    argument_names,
+    arguments,
     check_options,
     class_definition,
     read_config,
@@ -248,7 +249,7 @@ def _stated_value(config: Mapping[str, Any], key: str) -> Any:
 
 LINKED = {"model": {"scene", "recipe"}, "data": {"horizon"}}
 """Arguments that the command line takes from elsewhere."""
-INDENT, WIDTH = 30, 100
+INDENT = 30
 
 HELP = """\
 usage: nmpm {command} --config FILE [--SECTION.KEY VALUE ...]
@@ -334,12 +335,13 @@ def training_help(command: str, summary: str) -> str:
 
 
 def _described(group: str) -> Iterator[tuple[str, str]]:
-    """Arguments of --model.… or --data.…, in their order, and the first sentence about each."""
-    names = argument_names(group) - LINKED[group]
+    """Arguments of --model.… or --data.…, in their order: the first sentence about each, type and default."""
+    known = arguments(group)
     for file, name in SIGNATURES[group]:
         for key, text in _argument_texts(ast.get_docstring(class_definition(file, name)) or ""):
-            if key in names:
-                yield key, re.split(r"\. (?=[A-Z])|\.$", text)[0]
+            if key in known and key not in LINKED[group]:
+                default = "" if known[key].default in (None, "None") else f"; default: {known[key].default}"
+                yield key, f"{re.split(r'[.] (?=[A-Z])|[.]$', text)[0]} ({known[key].type}{default})"
 
 
 def _argument_texts(docstring: str) -> Iterator[tuple[str, str]]:
@@ -352,7 +354,7 @@ def _argument_texts(docstring: str) -> Iterator[tuple[str, str]]:
 
 def _entries(described: dict[str, str]) -> Iterator[str]:
     for key, text in described.items():
-        first, *others = textwrap.wrap(text, WIDTH - INDENT)
+        first, *others = textwrap.wrap(text, max(60, shutil.get_terminal_size().columns) - INDENT)
         start = f"  {key}".ljust(INDENT)
         yield start + first if len(start) == INDENT else f"{start}\n{' ' * INDENT}{first}"
         yield from (" " * INDENT + other for other in others)

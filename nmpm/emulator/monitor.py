@@ -21,10 +21,11 @@ from nmpm.transfer.execution import is_eager_cpu
 
 _CROWDING_EVERY = 16  # bundles: its sum over particles costs as much as all the rest
 _READ_EVERY = 16  # bundles, where reading measures back halts the device
+_LEAST_CROWDING = 3.0  # models of data that hardly compress (SPH) crowd cells of their own scenes 2.5 times
 _AT_WALLS, _CROWDING_LIMIT, _RESTING = "particles at the walls", "crowding limit", "at rest"
 
 
-_UNITS = {"speed": "{:.3g} cells per frame", "energy": "{:+.1%}", "crowding": "{:.3g} times a cell's volume"}
+_UNITS = {"speed": "{:.3g} cells per frame", "energy": "{:+.1%}", "crowding": "{:.3g} cells' volume in one cell"}
 """How measures are printed."""
 
 
@@ -70,8 +71,8 @@ class Monitor:
         speed: Largest step of a particle along an axis, in the last frame of a bundle, in the narrowest cells.
         energy_gain: Largest share of the first state's energy that may be gained; not watched where gravity is unknown,
             obstacles move, axes are open, or particles enter.
-        crowding: Largest volume fraction of a cell, measured every 16th bundle; the largest that the network is shown
-            when left out.
+        crowding: Largest volume fraction of a cell, measured every 16th bundle; the largest that the network is shown,
+            but at least 3, when left out.
         first_scene: Number of the batch's first scene, in incidents.
 
     Attributes:
@@ -167,7 +168,7 @@ class Monitor:
         measures = {"crowding": fraction.flatten(1).amax(1).to(last), _AT_WALLS: at_walls.sum(1).to(last)}
         if self.crowding is None:
             first, count = scene.input_channels.index(f"{scene.materials[0]}.volume"), len(scene.materials)
-            limit = emulator.input_high[first : first + count].amax()
+            limit = emulator.input_high[first : first + count].amax().clamp(min=_LEAST_CROWDING)
             measures[_CROWDING_LIMIT] = limit.to(last).expand(len(last))
         return measures
 
@@ -213,8 +214,15 @@ class Monitor:
 
     def report(self) -> str:
         """A summary of the rollout in a sentence or two."""
-        seen = ", ".join(f"{what} {_UNITS[what].format(value)}" for what, value in self.peaks.items() if what in _UNITS)
+        seen = ", ".join(_peak(what, value) for what, value in self.peaks.items() if what in _UNITS)
         exceeded = "; ".join(map(str, self.incidents)) or "none"
         still = f"{self.at_walls} particles at the walls, {self.rest_share:.0%} of all at rest on average"
         trust = f" {self.trust}" if self.trust else ""
         return f"{self._frames} frames. At most: {seen}; {still}. Limits exceeded: {exceeded}.{trust}"
+
+
+def _peak(what: str, value: float) -> str:
+    """A measure's largest value in words."""
+    if what == "energy" and value < 5e-4:  # which would be printed as +0.0%, or as a negative gain
+        return "energy never above the start's"
+    return f"{what} {_UNITS[what].format(value)}"

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nmpm.errors import UnstableError
+from nmpm.errors import ConfigError, UnstableError
+from nmpm.obstacles import Disc
 from nmpm.play.simulating import Simulated, simulate_for
 from nmpm.scene import Scene
 from nmpm.sim import InitialState, Preset
@@ -60,7 +61,12 @@ class SimulatorBeside:
         state = dataclasses.replace(
             state, obstacle=obstacle, obstacle_mask=torch.ones_like(obstacle[..., 0]).bool(), obstacle_share=None
         )
-        preset = fitting_preset(self._scene, state, self._preset)
+        try:
+            preset = fitting_preset(self._scene, state, self._preset)
+        except ConfigError as error:
+            if any(isinstance(body, Disc) for body in world.bodies.values()):
+                raise ConfigError("the simulator has no discs: take them away, then start it again (B)") from error
+            raise
         start, self._order = initial_state(self._scene, state, preset)
         self._there, self._count = state.mask[0].nonzero()[:, 0].numpy(), world.count
         self._run, self._due, self._frame = self._run + 1, 0, frame

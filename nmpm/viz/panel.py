@@ -22,8 +22,8 @@ from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
 SUPERSAMPLING = 3
 """Canvas points per pixel along each axis."""
-DISC_DIAMETER = 1.6
-"""Diameter of a disc in particle spacings: above √2, from which on the discs of a square lattice leave no gaps."""
+DISC_DIAMETER = 2.2
+"""Diameter of a disc in particle spacings: discs of neighbours overlap, also where a model spreads them unevenly."""
 DIAMETER_LIMITS = (2.2, 24.0)
 """Smallest and largest diameter of a disc in pixels."""
 DEPTH_FADE = 0.55

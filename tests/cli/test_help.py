@@ -1,5 +1,6 @@
 """The help of every command teaches: it has examples, and fits on a terminal of 100 columns."""
 
+import re
 from contextlib import suppress
 
 import pytest
@@ -35,6 +36,17 @@ def test_the_help_of_a_zoo_command_says_what_it_does(command, capsys):
     text = help_of(["zoo", command], capsys)
     assert text.split("\n\n")[1][:1].isupper()
     assert not [line for line in text.splitlines() if len(line) > WIDTH]
+
+
+def test_help_is_as_wide_as_the_terminal_with_types_and_defaults(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "160")
+    for command in ("fit", "rollout"):
+        assert max(map(len, help_of([command], capsys).splitlines())) > WIDTH
+    text = help_of(["fit"], capsys)
+    assert "(int; default: 8)" in text  # frames
+    assert "(str | None)" in text  # path
+    assert "--frames INTEGER" in help_of(["demo"], capsys)
+    assert re.search(r"--out PATH .*[(]default: played.h5[)]", help_of(["play"], capsys))
 
 
 def test_the_general_help_fits_and_zoo_alone_shows_its_own(capsys):

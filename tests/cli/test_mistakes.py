@@ -13,13 +13,18 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from lightning.pytorch import Trainer
 
 from nmpm import EmulatorModule, EmulatorRecipe, TrajectoryDataModule
 from nmpm._support.shipped import user_home
 from nmpm.cli import COMMANDS, expand_home, main
 from nmpm.cli.early_checks import PARTS, argument_names, class_names
+from nmpm.cli.options import RUNTIMES
+from nmpm.cli.stress import GROUP_NAMES
 from nmpm.cli.training import forget_unused_slurm
+from nmpm.emulator import runtimes
 from nmpm.errors import ConfigError, DataError
+from nmpm.evaluation.stress import GROUPS
 from nmpm.training.checkpoints import AtomicCheckpointIO
 from nmpm.training.preflight import check_disk
 from tests.scenes import box
@@ -144,6 +149,17 @@ def test_a_read_only_folder_is_found_before_the_work(words, monkeypatch, capsys)
     assert "is not writable (Read-only file system)" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["demo", "simulate", "zoo"])
+def test_an_interruption_is_one_line_without_an_empty_one(command, monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    module = import_module(COMMANDS[command][0])
+    monkeypatch.setattr(module, "_simulate" if command == "simulate" else "run", interrupt)
+    assert main([command, "goop"]) == 130
+    assert re.fullmatch(rf"nmpm {command}: interrupted[.;].*\n", capsys.readouterr().err)
+
+
 def test_wrong_commands(capsys):
     assert "did you mean fit?" in complain(["fti"], 2, capsys)
     assert main([]) == 2
@@ -153,6 +169,16 @@ EARLY = [
     (["--model.cels=3"], "did you mean --model.cells?"),
     (["--config", "mine.yaml"], "unknown key model.cels; did you mean model.cells?"),
     (["--model.processor=nmpm.processors.Unet"], "did you mean nmpm.processors.UNet?"),
+    (["--model.frames", "abc"], "--model.frames: abc is not of type int"),
+    (["--model.nothing", "3"], "there is no option --model.nothing. See --help_all"),
+    (["--model.widht", "3"], "did you mean --model.processor.width?"),
+    (["--trainer.max_steps", "abc"], "--trainer.max_steps: abc is not of type int"),
+    (["--trainer.max_stpes", "3"], "did you mean --trainer.max_steps?"),
+    (["--trainer.default_root_dir", "mine.yaml"], "--trainer.default_root_dir mine.yaml: it is a file"),
+    (["--data.source", "foo"], "--data.source: foo is not one of 'disk', 'simulate', 'hub'"),
+    (["--confg", "mine.yaml"], "there is no option --confg; did you mean --config?"),
+    (["--threads", "many"], "--threads: many is not of type int"),
+    (["fit"], "there are no data: give --data.path FOLDER"),
     (["--data.path", "nowhere"], "--data.path nowhere: there is no such dataset."),
     (["--data.name", "lava"], "No embedded dataset is called 'lava'"),
     (["--start_from", "nowhere"], "The zoo holds no model 'nowhere'"),
@@ -171,6 +197,13 @@ EARLY = [
     (["rollout", "goop", "--device", "cuda:first"], "--device cuda:first: it is not one of"),
     (["rollout", "goop", "--data", "nowhere"], "--data nowhere: there is no such file or folder"),
     (["rollout", "goop", "--fallback", "lava"], "There is no preset or file lava"),
+    (
+        ["rollout", "goop", "--runtime", "fast"],
+        "No runtime is called 'fast'; there are auto, openvino",
+    ),
+    (["stress", "goop", "--groups", "speed"], "--groups speed: the groups are long, settling, speeds"),
+    (["stress", "goop", "--runtime", "fast"], "No runtime is called 'fast'"),
+    (["demo", "waterdrop"], "waterdrop was not trained on scenes of a shipped simulator"),
     (["demo", "nowhere"], "The zoo holds no model 'nowhere'"),
     (["trade", "nowhere"], "DATASET nowhere: there is no such file or folder"),
     (["trade", "goop", "--models", "goop", "nowhere"], "The zoo holds no model 'nowhere'"),
@@ -234,6 +267,37 @@ def test_a_command_imports_what_it_needs(words, unwanted):
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-500:]
     assert done.stdout.splitlines()[-1] == "imported []"
+
+
+USAGES = [
+    (["demo", "goop", "--frames", "abc"], "argument --frames: invalid int value: 'abc'"),
+    (["stress", "goop", "--nothing"], "unrecognized arguments: --nothing"),
+    (["rollout", "goop", "--watch", "no"], "argument --watch: invalid choice: 'no'"),
+    (["zoo", "crad", "goop"], "argument COMMAND: invalid choice: 'crad'"),
+    (["zoo", "card"], "the following arguments are required: name"),
+    *(([command, "--no-such-option"], "") for command in COMMANDS),
+]
+
+
+@pytest.mark.parametrize(("words", "complaint"), USAGES, ids=lambda value: "")
+def test_a_wrong_call_is_one_line_that_names_the_help(words, complaint, capsys):
+    try:
+        status = main(words)
+    except SystemExit as ended:
+        status = ended.code
+    said = capsys.readouterr().err
+    assert status in (1, 2)
+    assert said.count("\n") == 1
+    assert complaint in said
+    assert "--help" in said
+
+
+def test_names_that_commands_have_without_torch_are_those_that_there_are():
+    assert tuple(GROUPS) == GROUP_NAMES
+    assert set(RUNTIMES) == {"auto", *runtimes.RUNTIMES}
+    for name in ("max_steps", "default_root_dir"):
+        assert name in argument_names("trainer")
+    assert argument_names("trainer") <= set(inspect.signature(Trainer.__init__).parameters)
 
 
 def test_simulators_and_numba_are_imported_for_simulated_data_alone():

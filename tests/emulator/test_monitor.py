@@ -3,6 +3,7 @@ import warnings
 import pytest
 import torch
 
+from nmpm import Zoo
 from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.emulator.monitor import Monitor, Policy, RolloutStoppedError
 from nmpm.emulator.rollouts import rollout, stream
@@ -29,6 +30,16 @@ def test_warn_speaks_once_for_each_kind():
     assert sorted(set(kinds)) == sorted(kinds)
     assert {"speed", "energy"} <= set(kinds)
     assert len(heard) == len(kinds)
+
+
+def test_a_shipped_model_of_sph_keeps_the_limits_on_its_own_scene():
+    model, monitor = Zoo.load("dambreak2d"), Monitor(Policy.STOP)
+    for _ in stream(model.emulator, model.example(seed=1), 136, monitor):
+        pass
+    shown = model.emulator.input_high[model.scene.input_channels.index("water.volume")]
+    assert 3 > monitor.peaks["crowding"] > float(shown)  # of the network's range, widened
+    assert not monitor.incidents
+    assert "energy never above the start's" in monitor.report()
 
 
 def test_crowding_is_the_fullest_cell():

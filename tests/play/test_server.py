@@ -146,6 +146,14 @@ def test_start_throw_drag_pour_close(page, server):
     goal = [0.5, 0.6]
     drag(page, body["centre"], goal)
     wait_until(page, f"Math.abs(play.stage.bodies[0].centre[1] - {goal[1]}) < 0.02")
+    page.select_option("#colour", "speed")
+    legend = (
+        "Array.from(document.querySelector('#legend canvas').getContext('2d').getImageData(0, 0, 1, 1).data).join()"
+    )
+    before = page.evaluate(legend)
+    page.keyboard.press("t")
+    wait_until(page, f"{legend} !== '{before}'")  # the scale is the theme's
+    page.keyboard.press("t")
     page.keyboard.press("p")
     page.keyboard.press(" ")
     count = page.evaluate("play.stage.films[0].count")

@@ -210,7 +210,12 @@ def test_the_simulator_begins_beside_the_emulator_once_it_is_ready(play):
     assert np.abs(simulated[first] - emulated[first - 1]).max() < 0.03
     ramps = play()
     assert ramps.do("put", kind="disc", centre=[0.3, 0.8]) is None
-    assert ramps.do("beside", on=True) is not None  # the simulator has no discs
+    no_discs = "the simulator has no discs: take them away, then start it again (B)"
+    assert ramps.do("beside", on=True) == no_discs
+    assert ramps.session._beside is None
+    assert ramps.do("remove", body=max(ramps.session.world.bodies)) is None
+    assert ramps.do("beside", on=True) is None
+    assert ramps.do("put", kind="disc", centre=[0.3, 0.8]) == no_discs  # said, and the simulator ends
     assert ramps.session._beside is None
 
 

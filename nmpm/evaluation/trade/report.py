@@ -24,6 +24,13 @@ from nmpm.viz.output import PictureStyle
 
 _SETTINGS = ("model", "weights", "precision", "constraints", "cells", "coarser", "substeps", "nudge", "runtime")
 _NAME = 12  # least width of the names in a terminal
+_WORDS = {
+    ", free": " free: without the model's constraints.",
+    "twin": " twin: the simulator with other substeps, how accurate the data are.",
+    "nudged": " nudged: from slightly other positions; no prediction gets below its error.",
+    "batch": " batch: so many scenes at once, ms of each.",
+}
+"""What words in the names of choices mean, for the table's caption."""
 _LIKELY = 0.05  # probability from which on a point may be in the Pareto set
 
 
@@ -227,6 +234,7 @@ def _summary(
         f"MSE{unit} of frames 1 to h. EMD{unit}: earth mover's distance in the last frame. Height: deviation of the"
         " particles' mean height in the last frame."
         + " ms: per frame, median. *: perhaps in the Pareto set." * _timed(points)
+        + "".join(text for word, text in _WORDS.items() if any(word in row[0] for row in rows))
         + " CRPS ×10⁻³: fair, of densities; of members ms is of all, MSE of the first." * crps,
         [
             *(

@@ -42,6 +42,7 @@ class Play {
     this.fill();
     this.listen();
     this.stage.setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+    this.showLegend();
     element("message").hidden = true;
   }
 
@@ -137,7 +138,6 @@ class Play {
     element("seed").value = scene.seed;
     this.showPlaying(scene.playing);
     this.showBeside(scene.beside);
-    this.showLegend();
   }
 
   /** Buttons of which one is chosen. */
@@ -200,7 +200,10 @@ class Play {
   toggleBeside() { this.send({ do: "beside", on: !this.stage.beside }); }
   put(kind) { this.send({ do: "put", kind, centre: scene.bounds.map(([low, high]) => (low + high) / 2) }); }
   remove() { if (this.stage.touched != null) this.send({ do: "remove", body: this.stage.touched }); }
-  turnTheme() { this.stage.setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark"); }
+  turnTheme() {
+    this.stage.setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
+    this.showLegend(); // its scale is the theme's
+  }
 
   restart() {
     const seed = Number(element("seed").value);

@@ -36,8 +36,8 @@ in vec3 position; uniform mat4 view; void main() { gl_Position = view * vec4(pos
 const FLAT = `#version 300 es
 precision highp float; uniform vec4 plain; out vec4 pixel; void main() { pixel = plain; }`;
 const MODES = { material: 0, speed: 1, error: 2, plain: 3, field: 4 };
-/** Diameter of a disc in spacings: above √2, from which on the discs of a square lattice leave no gaps. */
-const DISC_DIAMETER = 1.7;
+/** Diameter of a disc in spacings, as in panel.py: discs of neighbours overlap, also where a model spreads them unevenly. */
+const DISC_DIAMETER = 2.2;
 const FLOOR_TILES = 10;
 /** Which positions besides the particles' own a mode reads: 1 of the frame before, 2 of the reference. */
 const OTHERS = { [MODES.speed]: 1, [MODES.error]: 2 };
@@ -66,6 +66,7 @@ class Drawing {
     const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
     if (!gl) throw new Error("This browser does not offer WebGL 2, which the viewer needs.");
     this.gl = gl;
+    addEventListener("pagehide", ({ persisted }) => persisted || gl.getExtension("WEBGL_lose_context")?.loseContext());
     this.points = compile(gl, POINTS, DISC, ["position", "previous", "reference", "material", "field"]);
     this.lines = compile(gl, LINES, FLAT, ["position"]);
     this.colours = this.upload(colours);
