@@ -42,7 +42,7 @@ examples:
   nmpm trade goop --models goop runs/a runs/b   models of your own beside it
   nmpm trade goop --predictors mine:make        a predictor of another package: make(scene) gives it
   nmpm trade waterramps --members 8             ensembles of the models, judged by their fair CRPS
-  nmpm trade FOLDER --models runs/mine          recorded data of any form: errors, and how long the rest takes
+  nmpm trade FOLDER --models runs/mine          recorded data: errors, and how long the rest takes
   nmpm trade FOLDER --models runs/mine --times  ... and the rest: times, precisions, batches
   nmpm trade --print_config > sweep.yaml        what is measured; edit it, then:
   nmpm trade goop --config sweep.yaml
