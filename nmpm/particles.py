@@ -127,6 +127,8 @@ class Particles(Batched):
 
     def with_budget(self, budget: Tensor | None) -> Particles:
         """The same state with an energy (B,) that rollouts from it may have, see `budget`."""
+        if budget is self.budget:
+            return self
         same = copy.copy(self)
         object.__setattr__(same, "budget", budget)
         return same

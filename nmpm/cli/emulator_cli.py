@@ -21,10 +21,11 @@ from nmpm._support.collectives import RankWatch, is_lost_connection
 from nmpm._support.devices import device_name, find_device
 from nmpm._support.threads import stated_threads
 from nmpm.cli.console import BriefParser, explain, is_of_other_packages
-from nmpm.cli.early_checks import UsageError
+from nmpm.cli.early_checks import UsageError, read_config
 from nmpm.cli.matched_run import MatchedRun, add_arguments, stored_scene
 from nmpm.cli.options import check_folder
-from nmpm.cli.run_folder import CHECKPOINTS, SAVERS, RunFolder, next_folder
+from nmpm.cli.run_folder import CHECKPOINTS, CONFIG, SAVERS, RunFolder, next_folder
+from nmpm.cli.trust import OPTION, foreign_names
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.inspection.quick import contradictions_warning, stated_options
 from nmpm.data.loading.sources import FolderSource
@@ -261,7 +262,9 @@ class EmulatorCLI(LightningCLI):
             return "interrupted before the first step. The same command starts again; simulated trajectories are kept."
         step = self._saver(LastCheckpoint).saved_step
         stopped = f"stopped at step {step}" if step else "interrupted"
-        return f"{stopped}. Go on with: {shlex.join(['nmpm', 'fit', '--resume', str(self.run_folder.root)])}"
+        config = read_config(self.run_folder.root / CONFIG)
+        words = ["nmpm", "fit", "--resume", str(self.run_folder.root), *[OPTION][: len(foreign_names(config))]]
+        return f"{stopped}. Go on with: {shlex.join(words)}"
 
     def _test_best_weights(self) -> None:
         """Validate the last weights if no validation has, then test the best ones; without validations, the last."""

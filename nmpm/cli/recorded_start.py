@@ -44,7 +44,7 @@ class RecordedStart:
         written: The trajectory at the frames that are written: those of the data, or every k-th of them where the
             model's frames are so much longer; in the data's materials.
         scene: Of `written`.
-        recordings: Of the trajectory's split.
+        recordings: Of the trajectory's split, read as `written`.
         index: Of the trajectory.
         between: Frames of the model per written frame.
     """
@@ -94,12 +94,10 @@ class RecordedStart:
         match = match_data(model, data, *stated)
         sys.stdout.write(describe(match, model.name))
         scene = dataclasses.replace(data.scene, dt=data.scene.dt * match.reading.every)
-        window, written = (
-            collate([SplitRecordings(split, metadata, reading)[index]], reading)
-            for reading in (match.reading, Reading(scene, every=match.reading.every))
-        )
-        recordings = SplitRecordings(split, metadata, match.reading)
-        return cls(model.matched(match), window, written, scene, recordings, index, match.reading.between)
+        readings = (match.reading, Reading(scene, every=match.reading.every))
+        recordings = [SplitRecordings(split, metadata, reading) for reading in readings]
+        window, written = (collate([r[index]], r.reading) for r in recordings)
+        return cls(model.matched(match), window, written, scene, recordings[-1], index, match.reading.between)
 
 
 def is_of_kind(scene: Scene, metadata: Metadata, split: Split, index: int) -> bool:

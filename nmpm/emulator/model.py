@@ -284,6 +284,7 @@ class Emulator(nn.Module):
         if context is None:
             particles = self.with_plain_padding(particles)
             context = self.context(particles)
+        particles = particles.with_budget(None)  # the context has it: calls with and without are recorded as one
         if self.thread_choice is None:
             return self._with_budget(self.recorded_calls.predict(self, particles, context), context.budget)
         self.thread_choice.start()

@@ -217,7 +217,8 @@ def test_kernels_that_fail_or_differ_are_left_to_torch_with_one_warning(change, 
     monkeypatch.setitem(sys.modules, "nmpm.emulator.engines.triton.engine", made)
     on_gpu(monkeypatch)
     emulator, state = moving(box(), energy=True), state_of(box())
-    expected = TorchEngine(emulator).predict(state, RolloutContext(emulator.solid(state), emulator.budget(state)))
+    context = RolloutContext(emulator.solid(state), emulator.budget(state))
+    expected = TorchEngine(emulator).predict(emulator.with_plain_padding(state), context)
     if complaint:
         with pytest.warns(UserWarning, match=f"Kernels in Triton are not used on cpu, but torch's.*{complaint}"):
             emulator.context(state)

@@ -240,8 +240,7 @@ def test_padding_changes_nothing_to_the_bit_however_fast_and_wherever_it_is(kern
     with torch.no_grad(), nullcontext() if kernels else without_kernels():
         one, other = (emulator(state).position for state in (particles, padded(particles, anywhere, velocity=0.4)))
     assert torch.equal(other[:, :, :200], one)
-    if kernels:  # which do not compute it
-        torch.testing.assert_close(other[:, :, 200:], anywhere.expand_as(other[:, :, 200:]))
+    assert other.isfinite().all()
 
 
 def with_threads(numbers, action):

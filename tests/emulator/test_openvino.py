@@ -93,7 +93,7 @@ def test_networks_devices_and_types_that_it_does_not_take_are_named():
 
 def test_a_missing_package_is_named_with_its_installation(monkeypatch):
     monkeypatch.setitem(sys.modules, "openvino", None)
-    with pytest.raises(ConfigError, match=r'machines without OpenVINO: pip install "nmpm\[openvino\]"'):
+    with pytest.raises(ConfigError, match=r'machines without OpenVINO: pip install -e "\.\[openvino\]"'):
         small().with_runtime("openvino")
 
 

@@ -237,7 +237,9 @@ def test_an_interrupted_training_goes_on_by_the_command_that_it_prints(
     assert main(words) == 130
     stopped = step + (not validating)
     said = capfd.readouterr().err
-    command = re.search(rf"^nmpm fit: stopped at step {stopped}\. Go on with: nmpm (fit --resume run)$", said, re.M)
+    command = re.search(
+        rf"^nmpm fit: stopped at step {stopped}\. Go on with: nmpm (fit --resume run --trust-config)$", said, re.M
+    )
     assert command
     assert "Traceback" not in said
     assert torch.load("run/checkpoints/last.ckpt", weights_only=True)["global_step"] == stopped
