@@ -293,7 +293,9 @@ class Emulator(nn.Module):
         return self._with_budget(bundle, context.budget)
 
     def with_plain_padding(self, particles: Particles) -> Particles:
-        """A state whose padding rests in the middle of the domain, whatever it held."""
+        """A state whose padding rests in the middle of the domain, whatever it held; that of trainings is as it is."""
+        if self.training:
+            return particles
         return particles.with_padding_at([(low + high) / 2 for low, high in self.scene.domain])
 
     def _with_budget(self, bundle: Bundle, budget: Tensor | None) -> Bundle:

@@ -69,7 +69,7 @@ CHANGED_DATA: dict[str, Any] = {
     "limit_eval": 1,
     "eval_batch_size": 1,
 }
-ELSEWHERE = {"gravity", "family", "path", "name", "source", "generate", "reading", "resample", "smooth"}
+ELSEWHERE = {"gravity", "family", "path", "name", "source", "generate", "reading", "resample", "smooth", "files"}
 """Options of data that tests of their own change."""
 IN_EACH_RUN = ("gradient_discount", "emphasis", "density_cap")
 
