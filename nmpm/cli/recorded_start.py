@@ -95,9 +95,9 @@ class RecordedStart:
         sys.stdout.write(describe(match, model.name))
         scene = dataclasses.replace(data.scene, dt=data.scene.dt * match.reading.every)
         readings = (match.reading, Reading(scene, every=match.reading.every))
-        recordings = [SplitRecordings(split, metadata, reading) for reading in readings]
-        window, written = (collate([r[index]], r.reading) for r in recordings)
-        return cls(model.matched(match), window, written, scene, recordings[-1], index, match.reading.between)
+        predicted, recorded = (SplitRecordings(split, metadata, reading) for reading in readings)
+        window, written = (collate([each[index]], each.reading) for each in (predicted, recorded))
+        return cls(model.matched(match), window, written, scene, recorded, index, match.reading.between)
 
 
 def is_of_kind(scene: Scene, metadata: Metadata, split: Split, index: int) -> bool:

@@ -72,7 +72,7 @@ def test_without_a_faster_one_it_is_torch(model, monkeypatch):
     monkeypatch.setitem(sys.modules, "openvino", None)
     assert isinstance(model.optimized().emulator.runtime, Eager)
     assert isinstance(model.optimized("eager").emulator.runtime, Eager)
-    with pytest.raises(ConfigError, match=r"pip install \"nmpm\[openvino\]\""):
+    with pytest.raises(ConfigError, match=r"pip install -e \"\.\[openvino\]\""):
         model.optimized("openvino")
     with pytest.warns(UserWarning, match="runtime cuda-graph is now part of eager"):
         assert isinstance(model.optimized("cuda-graph").emulator.runtime, Eager)

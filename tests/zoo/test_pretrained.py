@@ -51,11 +51,11 @@ def test_over_a_wider_domain_the_same_weights_get_more_cells_of_the_same_size(mo
 
 
 def test_scenes_unlike_the_models_are_taken_with_a_warning_or_refused(model):
-    sideways = dataclasses.replace(model.scene, gravity=(9.81, 0.0))
-    with pytest.warns(UserWarning, match=r"Gravity of the data points along \[9.81, 0.0\]"):
-        assert model.over(sideways).scene == sideways
+    askew = dataclasses.replace(model.scene, gravity=(6.94, -6.94))
+    with pytest.warns(UserWarning, match=r"Gravity of the data points along \[6.94, -6.94\]"):
+        assert model.over(askew).scene == askew
     with pytest.raises(ConfigError, match="turn the data"):
-        model.fit_to(sideways, strict=True)
+        model.fit_to(askew, strict=True)
 
 
 @pytest.mark.parametrize("kind", ["folder", "dataset", "datamodule"])
