@@ -236,7 +236,7 @@ def test_an_operation_that_onnx_lacks_is_named(tmp_path):
 def test_what_is_missing_is_said(tmp_path, monkeypatch):
     part = Network(emulator_of(box()))
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(ConfigError, match=r'pip install "nmpm\[export\]"'):
+    with pytest.raises(ConfigError, match=r'pip install -e "\.\[export\]"'):
         FORMATS["onnx"].write(part, {}, tmp_path / "no.onnx")
     monkeypatch.setattr(torch._inductor.config.cpp, "cxx", (None, "no-such-compiler"))
     with pytest.raises(ConfigError, match=r"no C\+\+ compiler no-such-compiler.*--format onnx"):
