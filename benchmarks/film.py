@@ -45,7 +45,7 @@ class Column:
         self.positions = tuple(trajectories.positions.values())
         self.name = file.stem
         shipped, equal, model = _milliseconds(file.stem)
-        self.times = (f"{shipped:.2g} ms per frame; {equal:.2g} at the model's error", f"{model:.2g} ms per frame")
+        self.times = (f"{equal:.2g} – {shipped:.2g} ms", f"{model:.2g} ms")
 
     def draw(self, image: Image.Image, left: int, frame: int) -> None:
         """Draws the column with its texts, from this pixel on."""
