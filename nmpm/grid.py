@@ -82,15 +82,20 @@ class Grid:
         Raises:
             DataError: if that precision is too coarse so far from 0.
         """
-        self._check_precision(position.dtype)
+        self.check_precision(position.dtype)
         offset = per_axis(operator.sub, position, self.lower)
         return per_axis(operator.truediv, offset, self.spacing).to(dtype)
 
-    def resolves(self, dtype: torch.dtype) -> bool:
-        """Whether floating-point numbers at the domain's ends are at most 1/16 of a cell apart."""
-        return not any(step > _MAX_ROUNDING * h for _, step, h in self._steps(dtype))
+    def resolves(self, dtype: torch.dtype, cells: float = _MAX_ROUNDING) -> bool:
+        """Whether floating-point numbers at the domain's ends are at most so many cells apart, 1/16 if left out."""
+        return self.rounding(dtype) <= cells
 
-    def _check_precision(self, dtype: torch.dtype) -> None:
+    def rounding(self, dtype: torch.dtype) -> float:
+        """Largest distance between neighbouring floating-point numbers at the domain's ends, in cells."""
+        return max(step / h for _, step, h in self._steps(dtype))
+
+    def check_precision(self, dtype: torch.dtype) -> None:
+        """Raises a DataError if numbers at the domain's ends are more than 1/16 of a cell apart."""
         for axis, (reach, step, h) in enumerate(self._steps(dtype)):
             if step > _MAX_ROUNDING * h:
                 name = str(dtype).removeprefix("torch.")

@@ -5,7 +5,8 @@ Positions of absent particles are NaN and count nowhere; the displacement to or 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from nmpm.errors import DataError
 from nmpm.scene import Boundary, Interval, Scene
 
 STATISTICS_KEYS = ("vel_mean", "vel_std", "acc_mean", "acc_std")
+FINE_STEPS = 1000.0
+"""Float32 numbers between neighbouring particles that are enough."""
 _STILL = 1e-3  # of the extent; displacements up to it count as rest
 _SPACING_TRAJECTORIES = 8
 
@@ -48,6 +51,36 @@ class Extent:
         ]
         gone = f"{self.gone} particles leave the bounds of an open axis; they count as absent from then on."
         return [*beyond, gone] if self.gone else beyond
+
+
+def too_coarse(spacing: float, rounding: float, lower: Iterable[float]) -> Iterator[str]:
+    """Yields a sentence if float32 resolves coordinates too coarsely for particles of this spacing.
+
+    Args:
+        spacing: Distance of neighbours; infinite where it is unknown.
+        rounding: Distance of float32 numbers where coordinates are largest.
+        lower: The corner (D,) to subtract.
+    """
+    if spacing < FINE_STEPS * rounding:
+        places = max(0, math.ceil(-math.log10(spacing)) - 1) if spacing else 0  # the rest is about ten spacings
+        corner = ", ".join(f"{low:.{places}f}" for low in lower)
+        yield (
+            f"coordinates are so far from the origin that float32 has only {spacing / rounding:.3g} steps between"
+            f" neighbours ({FINE_STEPS:g} are enough). Subtract about ({corner}) from positions and bounds, in float64."
+        )
+
+
+def notes_on_rounding(metadata: Metadata) -> list[str]:
+    """A sentence if the bounds are too far from the origin for float32; none where the particles' volume is unknown."""
+    if metadata.particle_volume is None:
+        return []
+    spacing, corner = float(metadata.particle_volume ** (1 / metadata.dim)), [low for low, _ in metadata.bounds]
+    return [f"float32: {sentence}" for sentence in too_coarse(spacing, float32_rounding(metadata.bounds), corner)]
+
+
+def float32_rounding(box: Sequence[Interval]) -> float:
+    """Largest distance of neighbouring float32 numbers in a box (D,)."""
+    return float(np.spacing(np.float32(np.abs(box).max())))
 
 
 def extent_of(position: np.ndarray) -> Extent:

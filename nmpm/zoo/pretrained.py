@@ -84,7 +84,7 @@ class Pretrained(Predictor):
         material: str | Sequence[str] | ArrayLike | Tensor | None = None,
         obstacle: ArrayLike | Tensor | None = None,
         gravity: ArrayLike | Tensor | None = None,
-        dtype: torch.dtype = torch.float32,
+        dtype: torch.dtype | None = None,
         fields: Mapping[str, ArrayLike | Tensor] | None = None,
         bodies: Bodies | None = None,
         volume: ArrayLike | Tensor | None = None,
@@ -99,7 +99,8 @@ class Pretrained(Predictor):
             obstacle: (M, D) or (B, M, D) positions of particles that fill the obstacles.
             gravity: (D,) or (B, D), in domain length per second squared. Needed where gravity varies; elsewhere it may
                 be left out, and otherwise must be the scene's.
-            dtype: Of positions, velocities and gravity; float64 for domains far from the origin.
+            dtype: Of positions, velocities and gravity. When left out, float32; or float64 where the domain is so far
+                from the origin that float32 numbers are more than 2 × 10⁻⁴ cells apart (but on MPS, which lacks it).
             fields: Of `scene.fields`, by name: a number for all particles, (N,) or (B, N); (B,) of those that each
                 scene has one of. One that is left out has its mean over the training data.
             bodies: Obstacles of `nmpm.obstacles`, of D dimensions: a list for all scenes, or a list for each of B. To
@@ -113,8 +114,8 @@ class Pretrained(Predictor):
             ConfigError: if a body is impossible, or outside of the domain.
 
         Warns:
-            UserWarning: if the velocities look as if they were per frame, or particles start inside an obstacle; naming
-                fields that the model does not have.
+            UserWarning: if the velocities look as if they were per frame, particles start inside an obstacle, or the
+                positions' type is too coarse so far from the origin; naming fields that the model does not have.
         """
         builder = StateBuilder(self.emulator, position, dtype, math.inf if self.match else TOO_FAST)
         return builder.build(velocity, material, obstacle, gravity, fields, bodies, volume).to(self.emulator.device)

@@ -28,6 +28,9 @@ TOO_FAST = 2.0
 """Speeds above this multiple of the calibrated range are errors, unless the data have been compared with the model."""
 SUSPICIOUSLY_SLOW = 0.005
 """If no speed exceeds this fraction of the calibrated range, but speeds per frame would be within it, a warning."""
+FINE = 2e-4
+"""Cells between float32 numbers beyond which states are in float64."""
+_COARSE = 1e-3  # cells between numbers of the positions' type: a warning
 
 
 class StateBuilder:
@@ -36,16 +39,21 @@ class StateBuilder:
     Args:
         emulator: Gives the scene, and the range of velocities and gravity that it was calibrated for.
         position: (N, D) or (B, N, D).
-        dtype: Floating-point type of the state.
+        dtype: Floating-point type of the state; if None, float32, or float64 in domains too far from the origin.
         too_fast: Speeds above this multiple of the calibrated range are errors.
 
     Raises:
         DataError: if the positions have another shape.
     """
 
-    def __init__(self, emulator: Emulator, position: Any, dtype: torch.dtype, too_fast: float = TOO_FAST) -> None:
-        self.emulator, self.scene, self.dtype, self.too_fast = emulator, emulator.scene, dtype, too_fast
+    def __init__(
+        self, emulator: Emulator, position: Any, dtype: torch.dtype | None, too_fast: float = TOO_FAST
+    ) -> None:
+        self.emulator, self.scene, self.too_fast = emulator, emulator.scene, too_fast
+        single = emulator.device.type == "mps" or emulator.grid.resolves(torch.float32, FINE)
+        self.dtype = dtype or (torch.float32 if single else torch.float64)
         points = _numbers("position", position)
+        self._coarsest = max(self.dtype, _precision(position), key=lambda each: torch.finfo(each).eps)
         dim = self.scene.dim
         if points.dim() not in (2, 3) or points.shape[-1] != dim or not points.numel():
             raise DataError(
@@ -66,6 +74,7 @@ class StateBuilder:
         volume: Any = None,
     ) -> Particles:
         """The state, with velocities and gravity converted to frames; raises as `Pretrained.state`."""
+        self._check_precision()
         solid, share = self._obstacle(obstacle), None
         if bodies:
             solid, share = self._add_bodies(solid, bodies)
@@ -86,6 +95,19 @@ class StateBuilder:
         self._check_speeds(speed, kind)
         self._check_obstacles(state)
         return state
+
+    def _check_precision(self) -> None:
+        """Warn of positions of a type that is coarse at the domain's ends; a DataError if it is useless there."""
+        grid = self.emulator.grid
+        grid.check_precision(self._coarsest)
+        if not grid.resolves(self._coarsest, _COARSE):
+            name = str(self._coarsest).removeprefix("torch.")
+            corner = ", ".join(f"{low:.9g}" for low in grid.lower)
+            warnings.warn(
+                f"Positions are {name}, whose numbers are up to {grid.rounding(self._coarsest):.2g} cells apart in this"
+                f" domain. Give float64 ones, or subtract ({corner}) in float64 from positions, bounds and domain.",
+                stacklevel=4,
+            )
 
     def _fields(self, given: Mapping[str, Any]) -> dict[str, Tensor]:
         """The fields of the scene, (B, N) or (B, 1)."""
@@ -283,6 +305,14 @@ def _numbers(name: str, values: Any) -> Tensor:
     if tensor.is_complex() or tensor.dtype is torch.bool:
         raise DataError(f"{name} holds {str(tensor.dtype).removeprefix('torch.')} values; real numbers are needed.")
     return tensor.to("cpu", torch.float64, copy=True)
+
+
+def _precision(values: Any) -> torch.dtype:
+    """Floating-point type of values; float64 of what is none."""
+    if isinstance(values, Tensor):
+        return values.dtype if values.is_floating_point() else torch.float64
+    given = np.asarray(values).dtype
+    return {2: torch.float16, 4: torch.float32}.get(given.itemsize if given.kind == "f" else 8, torch.float64)
 
 
 def _format(values: Tensor) -> str:

@@ -1,3 +1,4 @@
+import dataclasses
 import warnings
 
 import numpy as np
@@ -206,3 +207,33 @@ def test_particles_that_start_inside_an_obstacle_are_named():
         warnings.simplefilter("error")
         model.state(inside[::2], obstacle=bar)
         model.state(inside)
+
+
+def moved(scene, shift):
+    bounds, domain = (tuple((low + shift, high + shift) for low, high in box) for box in (scene.bounds, scene.domain))
+    return dataclasses.replace(scene, bounds=bounds, domain=domain)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e3, 1e4, 1e6, -1e4])
+def test_rollouts_far_from_the_origin_are_those_at_it(shift):
+    torch.manual_seed(0)
+    model, arguments = model_of(box(obstacles=True)), {"velocity": (0.5, -0.3)}
+    solid = np.array([[0.45, 0.25], [0.47, 0.25]])
+    start = model.state(POSITIONS, obstacle=solid, dtype=torch.float64, **arguments)
+    far = model.fit_to(moved(model.scene, shift))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        state = far.state(POSITIONS + shift, obstacle=solid + shift, **arguments)
+    assert state.position.dtype == (torch.float64 if shift else torch.float32)
+    near, there = (each.double() for each in (model.rollout(start, 64), far.rollout(state, 64)))
+    assert float((there - shift - near).abs().max()) / model.emulator.grid.spacing[0] < 1e-3
+
+
+def test_positions_that_were_rounded_far_from_the_origin_are_named(model):
+    far = model.fit_to(moved(model.scene, 1e4))
+    single = (POSITIONS + 1e4).astype(np.float32)
+    for arguments in ({"position": single}, {"position": POSITIONS + 1e4, "dtype": torch.float32}):
+        with pytest.warns(UserWarning, match=r"float32, .* 0.016 cells apart .* subtract \(10000.08, 10000.08\)"):
+            far.state(**arguments)
+    with pytest.raises(DataError, match=r"float32 numbers have a spacing of .* Move the origin into the domain"):
+        model.fit_to(moved(model.scene, 1e6)).state((POSITIONS + 1e6).astype(np.float32))

@@ -26,6 +26,7 @@ from nmpm.data.statistics import (
     find_disagreements,
     first_moving_particle,
     notes_on_lengths,
+    notes_on_rounding,
 )
 from nmpm.errors import ConfigError, DataError
 
@@ -86,7 +87,7 @@ def _write(source: ForeignDataset, folder: Path, problems: list[str] | None) -> 
             _scale_times(folder / f"{name}.h5", factor)
     metadata, notes = log.final_metadata()
     write_metadata(folder, replace(metadata, extra=metadata.extra | {NOTES: [*source.notes, *notes]}))
-    return (*source.notes, *notes, *log.extent.notes(metadata))
+    return (*source.notes, *notes, *log.extent.notes(metadata), *notes_on_rounding(metadata))
 
 
 def _scale_times(path: Path, factor: float) -> None:

@@ -12,12 +12,11 @@ from nmpm.data.format import Metadata
 from nmpm.data.inspection.findings import Finding, Severity
 from nmpm.data.inspection.irregular_motion import FEW_CROSSINGS
 from nmpm.data.inspection.stated import correction
-from nmpm.data.statistics import Extent
+from nmpm.data.statistics import FINE_STEPS, Extent, too_coarse
 from nmpm.scene import Interval
 
 _MIXED = 1.1  # factor between time steps
 _RESOLUTIONS = 1.3  # factor between spacings
-_FINE = 1000.0  # roundings of coordinates in a spacing
 _WALL_LAYER = 0.025  # of the bounds: positions beyond it are not in a wall layer
 _TOO_LARGE, _FAR_TOO_LARGE = 3.0, 10.0  # times the extent of all positions
 _FEW_BOUNCES = 5
@@ -184,15 +183,8 @@ def _boundary(metadata: Metadata, axes: np.ndarray, kind: str) -> str:
 
 def check_precision(spacing: float, rounding: float, extent: Extent) -> Iterator[Finding]:
     """Yields a finding if float32 resolves coordinates too coarsely for the spacing of particles."""
-    if spacing < _FINE * rounding:
-        yield Finding(
-            "float32",
-            Severity.CONTRADICTION,
-            f"coordinates are so far from the origin that float32 has only {spacing / rounding:.3g} steps between"
-            f" neighbours ({_FINE:g} are enough). Subtract about ({', '.join(f'{low:.4g}' for low in extent.lower)})"
-            " from positions and bounds, in float64.",
-            factor=_FINE * rounding / spacing,
-        )
+    for sentence in too_coarse(spacing, rounding, extent.lower):
+        yield Finding("float32", Severity.CONTRADICTION, sentence, factor=FINE_STEPS * rounding / spacing)
 
 
 def check_types(metadata: Metadata, still: Mapping[int, int], moving: Mapping[int, int]) -> Iterator[Finding]:

@@ -27,7 +27,14 @@ from nmpm.data.format import ID, Metadata, Split, Trajectory
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.loading.presence import Presence, find_tracks, obstacle_frames
 from nmpm.data.split_files import split_paths
-from nmpm.data.statistics import are_outside, first_moving_particle, first_outside, without_those_gone
+from nmpm.data.statistics import (
+    are_outside,
+    first_moving_particle,
+    first_outside,
+    float32_rounding,
+    too_coarse,
+    without_those_gone,
+)
 from nmpm.data.times import check_times
 from nmpm.data.volumes import check_positive, mean_volume, stated_volumes, volumes
 from nmpm.errors import DataError
@@ -198,6 +205,9 @@ class SplitRecordings(Sequence[Recording]):
 
     Raises:
         DataError: if file and scene differ in the number of axes.
+
+    Warns:
+        UserWarning: if the scene is too far from the origin for the positions, which are float32.
     """
 
     def __init__(
@@ -208,6 +218,10 @@ class SplitRecordings(Sequence[Recording]):
         self.split, self.reading = split, reading
         self.indices = range(len(split)) if indices is None else indices
         self.reader = RecordingReader(metadata, reading)
+        bounds = reading.scene.bounds
+        corner = [low for low, _ in bounds]
+        for sentence in too_coarse(reading.scene.particle_spacing, float32_rounding(bounds), corner):
+            warnings.warn(f"{split.path.parent}: {sentence}", stacklevel=1)  # once for a dataset
 
     def __len__(self) -> int:
         return len(self.indices)

@@ -1,3 +1,4 @@
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -61,6 +62,16 @@ def test_a_killed_conversion_leaves_no_dataset_and_the_next_one_removes_its_file
     assert not (tmp_path / "out").exists()
     write_native(source_of(made_up_trajectory(5, 3)), tmp_path / "out")
     assert [item.name for item in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize(("shift", "said"), [(0.0, False), (1000.0, True)])
+def test_a_conversion_notes_positions_that_float32_rounds(tmp_path, shift, said):
+    run = made_up_trajectory(12, 3)
+    source = source_of(dataclasses.replace(run, position=run.position + np.float32(shift)))
+    metadata = dataclasses.replace(source.metadata, particle_volume=0.02**2)
+    metadata = dataclasses.replace(metadata, bounds=tuple((a + shift, b + shift) for a, b in metadata.bounds))
+    notes = write_native(dataclasses.replace(source, metadata=metadata), tmp_path / "out")
+    assert any("Subtract about (1000." in note and note.startswith("float32: ") for note in notes) == said
 
 
 def test_notes_on_inconsistencies(tmp_path):

@@ -291,7 +291,7 @@ LIES: dict[str, tuple[Callable[[Data], object], str, float | None]] = {
     "order once": (lambda data: data.change(shuffled_once, ONE), "particle order: .*train 00002, frame 20", None),
     "resolution": (lambda data: data.change(lambda run: thrown_block(9, spacing=0.03), ONE),
                    "different resolution: .*train 00002.* 1.5 times", 1.5),
-    "far from the origin": (lambda data: data.move(1000.0), "float32: .*Subtract about .1000, 1000.", None),
+    "far from the origin": (lambda data: data.move(1000.0), "float32: .*Subtract about .1000.0, 1000.0", None),
     "short": (lambda data: data.change(lambda run: run[:12], slice(0, 2)), "short trajectories: 2 of 5", 0.4),
     "noise": (lambda data: data.change_all(noisy), "measurement noise: .* errors of about 0.01.*--smooth 13", None),
     "overlap": (lambda data: data.change(doubled, ONE), "overlapping particles: .*train 00002", None),

@@ -1,3 +1,6 @@
+import dataclasses
+import warnings
+
 import h5py
 import numpy as np
 import pytest
@@ -70,3 +73,16 @@ def test_unwrap_inverts_wrapping(seed, frames):
     wrapped = torch.stack([path[..., 0].remainder(2), path[..., 1]], dim=-1)
     unwrap(wrapped, scene)
     torch.testing.assert_close(wrapped, path, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize(("shift", "coarse"), [(0.0, 0), (50.0, 0), (1e4, 1)])
+def test_positions_that_float32_rounds_are_a_warning(make_dataset, shift, coarse):
+    folder = make_dataset()
+    recordings = recordings_of(folder)
+    scene = recordings.reading.scene
+    bounds, domain = (tuple((a + shift, b + shift) for a, b in box) for box in (scene.bounds, scene.domain))
+    far = dataclasses.replace(scene, bounds=bounds, domain=domain)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        SplitRecordings(recordings.split, recordings.reader.metadata, Reading(far))
+    assert [str(each.message).startswith(f"{folder}: coordinates are so far") for each in caught] == [True] * coarse
