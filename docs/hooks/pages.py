@@ -19,7 +19,7 @@ from unittest import mock
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from nmpm.cli import COMMANDS, main, usage
+from nmpm.cli import COMMANDS, main
 from nmpm.emulator.engines import rules
 
 ROOT = Path(__file__).parents[2]
@@ -84,7 +84,7 @@ def generated_pages() -> dict[str, str]:
 
 def commands_page() -> str:
     """Help of all commands."""
-    sections = [f"# Commands\n\n{_block(usage())}"]
+    sections = [f"# Commands\n\n{_block(help_of())}"]
     for name, (_, summary) in COMMANDS.items():
         short = name in TRAINING and name != "fit"  # as fit
         sections.append(f"## nmpm {name}\n\n{_training(summary) if short else _block(help_of(name))}")

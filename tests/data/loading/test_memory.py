@@ -44,4 +44,5 @@ def test_memory_is_bounded_by_the_buffer(tmp_path):
     ]  # fmt: skip
     assert runs[0].stdout.strip() == "240", runs[0].stderr[-2000:]
     assert runs[1].returncode != 0
-    assert "MemoryError" in runs[1].stderr or "alloc" in runs[1].stderr
+    lacking = ("MemoryError", "alloc", "filter returned failure")  # the last is HDF5's word where a filter gets none
+    assert any(words in runs[1].stderr for words in lacking), runs[1].stderr[-2000:]
