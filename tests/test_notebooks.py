@@ -2,6 +2,7 @@
 
 import ast
 import base64
+import hashlib
 import json
 import logging
 import re
@@ -39,6 +40,7 @@ BUDGETS: dict[str, dict[str, object]] = {
     "your_own_data": {"RUNS, FRAMES, PARTICLES": (4, 60, 60), "STEPS": 2},
 }
 """Constants of the notebooks, by what they are here; only how much is computed changes."""
+NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 LOADED = re.compile(r'Zoo\.load\("([\w/-]+)"(?:, variant="(\w+)")?')
 if not NOTEBOOKS.is_dir():
     pytest.skip("notebooks are not part of this distribution", allow_module_level=True)
@@ -104,6 +106,16 @@ def test_notebooks_import_public_names_only(path):
 
 
 @every_notebook
+def test_axes_of_the_notebooks_state_units_or_what_they_count(path):
+    if path.stem == "inverse_design":
+        pytest.xfail("its searches are timed: their chart gets units with the next run on an idle machine")
+    code = "\n".join(read_code(path))
+    labels = re.findall(r'[xy]label="(.*?)"', code)
+    assert labels or ".plot(" not in code
+    assert [label for label in labels if not re.search(r"\(.+\)|%|number of", label)] == []
+
+
+@every_notebook
 def test_notebooks_are_stored_as_one_run_left_them(path):
     cells = read_cells(path)
     assert [cell["execution_count"] for cell in cells] == list(range(1, len(cells) + 1))
@@ -124,6 +136,58 @@ def test_notebooks_are_stored_as_the_shipped_weights_left_them(path):
     names = {"/".join(filter(None, match)) for match in LOADED.findall("\n".join(read_code(path)))} & set(Zoo.list())
     shipped = {name: Zoo.card(name)["sha256"][:12] for name in names}
     assert json.loads(path.read_text(encoding="utf-8"))["metadata"].get("weights") == shipped
+
+
+@every_notebook
+def test_notebooks_are_stored_as_their_code_left_them(path):
+    """After an edit of a cell, `python benchmarks/run_notebooks.py` runs them again."""
+    digest = hashlib.sha256("\n".join(read_code(path)).encode()).hexdigest()[:12]
+    assert json.loads(path.read_text(encoding="utf-8"))["metadata"].get("code") == digest
+
+
+def printed(cell: dict[str, Any]) -> str:
+    """What a cell printed or returned as text alone, unless its tag says that time or training decide it."""
+    if cell["cell_type"] != "code" or "not-compared" in cell["metadata"].get("tags", []):
+        return ""
+    texts = [output.get("text") or output["data"]["text/plain"] for output in cell["outputs"] if is_text(output)]
+    return "".join("".join(text) for text in texts)
+
+
+def is_text(output: dict[str, Any]) -> bool:
+    return output["output_type"] == "stream" or set(output["data"]) == {"text/plain"}
+
+
+def assert_same_text(old: str, new: str) -> None:
+    """Equal words, and numbers within 2%."""
+    assert NUMBER.sub("#", new).split() == NUMBER.sub("#", old).split()
+    values = [[float(number) for number in NUMBER.findall(text)] for text in (new, old)]
+    assert values[0] == pytest.approx(values[1], rel=0.02)
+
+
+def test_texts_differ_by_a_word_or_a_number_not_by_the_last_digit_or_spaces():
+    assert_same_text("MSE 1.234e-04  of 3", "MSE 1.233e-04 of 3")
+    for other in ("MSE 1.334e-04 of 3", "RMS 1.234e-04 of 3", "MSE 1.234e-03 of 3", "MSE -1.234e-04 of 3", "MSE"):
+        with pytest.raises(AssertionError):
+            assert_same_text("MSE 1.234e-04 of 3", other)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@every_notebook
+def test_notebooks_print_today_what_is_stored(path, tmp_path, monkeypatch):
+    """Until the last cell that is compared: trainings come later."""
+    nbformat = pytest.importorskip("nbformat")
+    pytest.importorskip("nbclient")
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.syspath_prepend(NOTEBOOKS.parent / "benchmarks")
+    notebook = nbformat.read(path, as_version=4)
+    stored = [printed(cell) for cell in notebook.cells]
+    assert any(stored)
+    notebook.cells = notebook.cells[: 1 + max(index for index, text in enumerate(stored) if text)]
+    import_module("run_notebooks").execute(notebook)
+    for cell, text in zip(notebook.cells, stored, strict=False):
+        assert_same_text(text, printed(cell))
 
 
 def test_quickstart_predicts_a_scene_and_leaves_pictures(run):
@@ -157,16 +221,6 @@ def test_speed_and_accuracy_read_the_committed_tables(run):
     assert all(len(taken) == 1 for taken in names["seconds"].values())
 
 
-@pytest.fixture(params=["made up", pytest.param("sample", marks=pytest.mark.slow)])
-def foreign_data(request, monkeypatch):
-    """Grains that the notebooks make up, or those of the recorded data."""
-    if request.param == "sample":
-        request.getfixturevalue("recorded")
-    else:
-        monkeypatch.delenv("NMPM_TEST_DATA", raising=False)
-
-
-@pytest.mark.usefixtures("foreign_data")
 def test_your_own_data_become_a_film_and_a_model_that_anybody_can_load(run):
     names = run("your_own_data")
     assert names["predicted"].shape == (58, 60, 2)
@@ -175,8 +229,7 @@ def test_your_own_data_become_a_film_and_a_model_that_anybody_can_load(run):
     assert Image.open("film.gif").n_frames > 1
 
 
-@pytest.mark.usefixtures("foreign_data")
-def test_fine_tuning_takes_foreign_data_and_leaves_a_better_model_and_a_picture(run):
+def test_fine_tuning_takes_data_in_other_units_and_leaves_a_better_model_and_a_picture(run):
     names = run("fine_tuning")
     assert names["start"].match.reading.scene.materials == ("sand",)
     assert min(names["overall"]) < 0.6 * names["overall"][0]  # 0.2 to 0.3 as measured

@@ -156,7 +156,7 @@ class _Snapshots:
         largest = max(1e-12, *(float(error.max()) for error in errors.values()))
         # A prediction with a larger error has left the box; showing all of it would flatten the rest of the curve.
         diagonal = math.dist(*zip(*self.trajectories.outer_bounds, strict=True))
-        title = "RMS position error (domain length" + ("; cut at the box's diagonal)" if largest > diagonal else ")")
+        title = "RMS position error (length" + ("; cut at the box's diagonal)" if largest > diagonal else ")")
         (axes,) = self._add_charts([title])
         for (label, error), line in zip(errors.items(), LINE_COLOURS * len(errors), strict=False):
             axes.plot(error, color=line, lw=1.3, label=f"{label} against {reference}")

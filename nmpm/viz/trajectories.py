@@ -179,7 +179,7 @@ class LabelledTrajectories:
         return ~np.isin(self.material, list(self.prescribed))
 
     def rms_errors(self) -> dict[str, NDArray[np.float64]]:
-        """Root mean square position error of each later trajectory against the first, (T,) in domain length.
+        """Root mean square position error of each later trajectory against the first, (T,) in length.
 
         Of the particles that are there in both; 0 where none is.
         """

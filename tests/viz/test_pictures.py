@@ -66,6 +66,11 @@ def test_the_size_of_snapshots_follows_from_columns_and_rows(falling, tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["1.png", "3.png", "row.png"]
 
 
+def test_the_chart_of_errors_is_in_the_length_of_the_data_whatever_it_is(falling, tmp_path):
+    text = write_snapshots(falling, tmp_path / "a.svg", columns=2).read_text(encoding="utf-8")
+    assert "RMS position error (length)" in text
+
+
 def test_snapshots_run_from_left_to_right_with_the_prediction_below(falling, tmp_path):
     rows, columns = water_in(image := pixels(write_snapshots(falling, tmp_path / "a.png", columns=2)), top=110)
     first = columns < image.shape[1] // 2
