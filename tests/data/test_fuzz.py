@@ -36,7 +36,7 @@ ROOT = Path(__file__).parents[2]
 MEMORY = 2**30
 
 dmcf = pytest.importorskip("tests.data.convert.test_dmcf", reason="the extra `convert` is not installed")
-TRIES, FOLDER_TRIES = 500, 200
+TRIES, FOLDER_TRIES = 500, 100
 METADATA = {"bounds": [[0.1, 0.9], [0.1, 0.9]], "sequence_length": 6, "dim": 2, "dt": 0.0025, "gravity": [0, -9.81],
             "particle_types": {"3": "boundary", "5": "water"}, "static_types": [3], "domain": [[0, 1], [0.1, 0.9]],
             "periodic_boundary_conditions": [False, True], "densities": {"water": 1000.0}, "vel_std": [1e-3, 1e-3],
