@@ -13,6 +13,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import cache
@@ -67,7 +68,8 @@ def iterate_isolated(function: Callable[..., Any], path: Path, *arguments: Any) 
     request = [f"{function.__module__}:{function.__name__}", str(path), list(arguments), limit]
     idle = _idle_children(os.getpid())
     child = idle.pop() if idle else _Child()
-    while not child.send(request):  # it has ended, as it was idle
+    while child.is_about_to_end() or not child.send(request):
+        child.end()
         child = _Child()
     waits = False  # for the next call
     try:
@@ -89,6 +91,7 @@ def iterate_isolated(function: Callable[..., Any], path: Path, *arguments: Any) 
         raise
     finally:
         if waits:
+            child.last_used = time.monotonic()
             idle.append(child)
         else:
             child.end()
@@ -114,6 +117,11 @@ class _Child:
             start_new_session=True,  # Ctrl-C is its parent's
         )
         self.process, self._requests, self._answers = process, cast(BinaryIO, process.stdin), cast(Any, process.stdout)
+        self.last_used = time.monotonic()
+
+    def is_about_to_end(self) -> bool:
+        """Whether it may end before it reads the next request, as it has been idle."""
+        return time.monotonic() - self.last_used > _IDLE_SECONDS / 2
 
     def send(self, message: Any) -> bool:
         """Send a line; False if the process has ended."""
