@@ -263,7 +263,8 @@ class EmulatorCLI(LightningCLI):
         step = self._saver(LastCheckpoint).saved_step
         stopped = f"stopped at step {step}" if step else "interrupted"
         config = read_config(self.run_folder.root / CONFIG)
-        words = ["nmpm", "fit", "--resume", str(self.run_folder.root), *[OPTION][: len(foreign_names(config))]]
+        trust = [OPTION] if foreign_names(config) else []
+        words = ["nmpm", "fit", "--resume", str(self.run_folder.root), *trust]
         return f"{stopped}. Go on with: {shlex.join(words)}"
 
     def _test_best_weights(self) -> None:
