@@ -29,11 +29,9 @@ from timing import make_parser, write_json
 from torch import Tensor
 
 from nmpm._support.progress import progress_bar
-from nmpm.data.format import Metadata, Split, Trajectory, read_metadata
-from nmpm.data.loading.evaluation import EvaluationLoader
-from nmpm.data.loading.recording import RecordingReader, SplitRecordings
+from nmpm.data.format import Metadata, Split, Trajectory, find_split, read_metadata
+from nmpm.data.recordings import EvaluationLoader, RecordingReader, SplitRecordings
 from nmpm.data.simulation import SimulationRequest
-from nmpm.data.split_files import find_split
 from nmpm.emulator import Prescribed, stream_members, stream_rollout
 from nmpm.emulator.prescribed import with_predicted
 from nmpm.errors import UnstableError
@@ -44,7 +42,7 @@ from nmpm.metrics.quantities import into_domain, measure_shape
 from nmpm.particles import Window
 from nmpm.scene import Reading, Scene
 from nmpm.sim import preset_from_dict
-from nmpm.sim.predictability import nudge
+from nmpm.sim.preset import nudge
 from nmpm.transfer import Nearest
 from nmpm.zoo.registry import load_model
 

@@ -21,8 +21,7 @@ import torch
 from torch import Tensor
 
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.loading.evaluation import EvaluationLoader
-from nmpm.data.loading.recording import SplitRecordings
+from nmpm.data.recordings import EvaluationLoader, SplitRecordings
 from nmpm.evaluation.prediction_errors import field_error
 from nmpm.particles import Window
 from nmpm.scene import Reading, Scene

@@ -25,14 +25,16 @@ from graph_network import HISTORY, GraphSimulator, Neighbours, extend_back
 from torch import Tensor
 
 from nmpm._support.atomic import atomic_write
-from nmpm._support.digests import short_digest
-from nmpm.data.catalog import catalog, ensure
+from nmpm._support.digests import weights_digest
+from nmpm.data.catalog import ensure
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.loading.recording import Recording, SplitRecordings
+from nmpm.data.recordings import SplitRecordings
 from nmpm.data.scene_inference import infer_scene
+from nmpm.data.windows import Recording
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Particles
 from nmpm.scene import Reading, Scene
+from nmpm.sim import preset_names
 
 CHECKS = 24
 """Validation losses per training, beside those of the written simulators."""
@@ -191,7 +193,7 @@ class GraphPredictor:
     def __init__(self, simulator: GraphSimulator, curve: Sequence[tuple[float, float]]) -> None:
         self.simulator = simulator
         steady = "" if converged(curve) else ", not converged"
-        self.name = f"GNS {short_digest(simulator.state_dict())}, {curve[-1][0]:.3g} min of training{steady}"
+        self.name = f"GNS {weights_digest(simulator.state_dict())[:12]}, {curve[-1][0]:.3g} min of training{steady}"
 
     def __call__(self, particles: Particles, frames: int) -> Tensor:
         return self.simulator.rollout(particles, frames)
@@ -246,7 +248,7 @@ def _recordings(folder: Path, scene: Scene, split: str) -> list[Recording]:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
-    add("dataset", choices=catalog())
+    add("dataset", choices=preset_names())
     add("--minutes", type=float, nargs="+", default=[2.0, 5.0, 10.0], help="written then; the last ends")
     add("--trajectories", type=int, default=40, help="to train on")
     add("--width", type=int, default=32, help="of latent vectors; the paper's is 128")

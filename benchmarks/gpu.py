@@ -19,7 +19,7 @@ from pathlib import Path
 
 from timing import make_parser
 
-from nmpm._support.devices import DEVICES, find_device
+from nmpm._support.machine import DEVICES, find_device
 from nmpm.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parent.parent

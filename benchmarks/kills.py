@@ -140,7 +140,7 @@ def run(words: Sequence[str]) -> None:
 def start(words: Sequence[str]) -> ForkServerProcess:
     """A process of nmpm, in which its modules are imported already."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["nmpm.cli.run_training", "nmpm.data.generate"])
+    context.set_forkserver_preload(["nmpm.cli.run_training", "nmpm.data.simulation"])
     process = context.Process(target=run_silently, args=(list(words),))
     process.start()
     return process

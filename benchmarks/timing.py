@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import torch
 
 from nmpm._support.atomic import atomic_write
-from nmpm._support.devices import DEVICES, find_device
+from nmpm._support.machine import DEVICES, find_device
 from nmpm._support.messages import counted
 from nmpm.errors import ConfigError
 from nmpm.evaluation.machine import Action, Clock, describe_device, peak_bytes, wall_clock

@@ -22,16 +22,14 @@ from torch import Tensor, nn
 
 from nmpm._support.progress import progress_bar
 from nmpm.data.format import Trajectory
-from nmpm.data.generate import preset_metadata
-from nmpm.data.initial_states import thrown_blocks
-from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.recording import RecordingReader
-from nmpm.data.simulation import derive_seed
+from nmpm.data.recordings import RecordingReader
+from nmpm.data.simulation import derive_seed, preset_metadata
+from nmpm.data.windows import collate
 from nmpm.decoders import Absolute, Decoder, Residual
 from nmpm.emulator import Bundle, Emulator, EmulatorRecipe, RolloutContext
 from nmpm.emulator.calibration import calibrate
 from nmpm.emulator.constraints import Constraints
-from nmpm.particles import Particles, Window
+from nmpm.particles import Particles, Window, thrown_blocks
 from nmpm.processors import UNet
 from nmpm.scene import Reading, Scene
 from nmpm.sim import Preset, load_preset

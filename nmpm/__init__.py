@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 from nmpm._support.version import __version__
 
 if TYPE_CHECKING:
-    from nmpm.data.arrays import write_trajectories as write_trajectories
     from nmpm.data.datamodule import TrajectoryDataModule as TrajectoryDataModule
     from nmpm.data.dataset import load_trajectories as load_trajectories
+    from nmpm.data.dataset import write_trajectories as write_trajectories
     from nmpm.data.format import Trajectory as Trajectory
     from nmpm.emulator import Emulator as Emulator
     from nmpm.emulator import EmulatorRecipe as EmulatorRecipe
@@ -36,7 +36,7 @@ _MODULE_OF = {
     "load_trajectories": "nmpm.data.dataset",
     "rollout": "nmpm.emulator",
     "view": "nmpm.viz.viewer",
-    "write_trajectories": "nmpm.data.arrays",
+    "write_trajectories": "nmpm.data.dataset",
 }
 
 __all__ = [*_MODULE_OF, "__version__"]

@@ -159,19 +159,15 @@ class Scene:
         for name in ("domain", "boundary") + (("gravity",) if self.gravity is not None else ()):
             if len(getattr(self, name)) != self.dim:
                 raise ConfigError(f"Scene.{name} = {getattr(self, name)} needs one entry for each of {self.dim} axes.")
-        for axis, ((low, high), (outer_low, outer_high)) in enumerate(zip(self.bounds, self.domain, strict=True)):
+        for axis, (inner, outer, kind) in enumerate(zip(self.bounds, self.domain, self.boundary, strict=True)):
+            (low, high), (outer_low, outer_high) = inner, outer
             if not (outer_low <= low < high <= outer_high and math.isfinite(outer_high - outer_low)):
-                raise ConfigError(
-                    f"On axis {axis} the domain {(outer_low, outer_high)} must contain the bounds {(low, high)}."
-                )
-        for kind in self.boundary:
+                raise ConfigError(f"On axis {axis} the domain {outer} must contain the bounds {inner}.")
             if kind not in get_args(Boundary):
                 raise ConfigError(f"Boundary {kind!r} is not one of {', '.join(get_args(Boundary))}.")
-        for axis, wraps in enumerate(self.periodic):
-            bounds, domain = self.bounds[axis], self.domain[axis]
-            if wraps and max(abs(a - b) for a, b in zip(bounds, domain, strict=True)) > _SAME * (domain[1] - domain[0]):
+            if kind == "periodic" and max(low - outer_low, outer_high - high) > _SAME * (outer_high - outer_low):
                 raise ConfigError(
-                    f"Axis {axis} is periodic: the bounds {bounds} and the domain {domain} must be the same, one period"
+                    f"Axis {axis} is periodic: the bounds {inner} and the domain {outer} must be the same, one period"
                     " apart."
                 )
         if self.moving_obstacles and not self.obstacles:

@@ -12,7 +12,7 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
-from nmpm._support.devices import find_device
+from nmpm._support.machine import find_device
 from nmpm.data.format import write_metadata, write_split
 from nmpm.errors import ConfigError
 from nmpm.testing import ProcessorContract, TransferContract
@@ -73,6 +73,26 @@ def browser():
         chromium = running.chromium.launch(executable_path=CHROMIUM, args=list(CHROMIUM_OPTIONS))
         yield chromium
         chromium.close()
+
+
+@pytest.fixture
+def visit(browser):
+    """Opens an address in a window and waits for a condition; fails at the end if a page logged an error."""
+    windows, errors = [], []
+
+    def visit(address, ready, width, height):
+        windows.append(browser.new_context(viewport={"width": width, "height": height}))
+        page = windows[-1].new_page()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        page.goto(address)
+        wait_until(page, ready)
+        return page
+
+    yield visit
+    for window in windows:
+        window.close()
+    assert not errors
 
 
 def wait_until(page, condition):

@@ -16,7 +16,7 @@ import torch
 from scenes import cloud
 
 from nmpm.data import catalog
-from nmpm.data.generate import generate
+from nmpm.data.simulation import generate
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
 from nmpm.sim import load_preset
@@ -159,7 +159,7 @@ def test_every_variant_of_a_sweep_builds_a_model(name):
     import ablation
 
     sweep = ablation.Sweep.read(ROOT / "sweeps" / f"{name}.yaml")
-    scene = catalog.scene("goop")
+    scene = load_preset("goop").scene
     for variant in sweep.variants:
         config = sweep.config_of(variant)
         emulator = ablation.build_module(config, scene).emulator.eval()

@@ -4,16 +4,27 @@ import ast
 import inspect
 import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import fields
 from importlib import import_module
+from typing import Any
 
 from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint
 
 from nmpm._support.shipped import PACKAGE
 from nmpm.cli import COMMANDS
-from nmpm.cli.early_checks import argument_names
-from nmpm.data.split_files import SPLITS
+from nmpm.cli.command import Command, label
+from nmpm.cli.training import known_options
+
+
+def commands(kinds: Iterable[Any]) -> Iterator[type[Command]]:
+    """Commands that are dataclasses of options, and those within groups."""
+    for kind in kinds:
+        if isinstance(kind, type):
+            yield kind
+            yield from commands(getattr(kind, "commands", {}).values())
+
 
 TREES = {
     str(path.relative_to(PACKAGE)): ast.parse(path.read_text(encoding="utf-8"))
@@ -21,33 +32,33 @@ TREES = {
 }
 SAVER = set(inspect.signature(ModelCheckpoint).parameters)
 SECTIONS = {
-    "model": argument_names("model"),
-    "data": argument_names("data"),
+    "model": set(known_options()["model"]),
+    "data": set(known_options()["data"]),
     "trainer": set(inspect.signature(Trainer).parameters),
     "checkpoint": SAVER,
     "resume": SAVER,
 }
 LIGHTNING = {
-    "config",
-    "ckpt_path",
-    "print_config",
     "help",
     "help_all",
     "version",
-    "seed_everything",
     "verbose",
-    "trust-config",
+    "weights_only",
 }
-SIMULATE = {f"--{split}" for split in SPLITS}  # in a loop there
-OPTIONS = {f"--{name}" for name in (*LIGHTNING, *SECTIONS)} | SIMULATE | {
+OPTIONS = {f"--{name}" for name in (*LIGHTNING, *SECTIONS)} | {
     word.value
     for tree in TREES.values()
     for node in ast.walk(tree)
     if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument"
     for word in node.args
     if isinstance(word, ast.Constant)
-}  # fmt: skip
-OTHER_PROGRAMS = re.compile(r"pip install[^:;({]*|`hf [^`]*`|--include \{}|nmpm\.plugins")
+} | {label(field) for kind in commands(COMMANDS.values()) for field in fields(kind)}  # fmt: skip
+OTHER_PROGRAMS = re.compile(
+    r"pip install[^:;({]*|`hf [^`]*`|--include \{}|nmpm\.(?:plugins|readers|writers|scenes|commands)\b"
+)
+
+EXTRAS = {"install": 0, "require": 1}
+"""Functions that name an extra, and the position of its argument."""
 
 
 def texts(tree: ast.Module) -> Iterator[str]:
@@ -102,10 +113,12 @@ def test_extras_that_messages_name_exist():
     ]
     written = {extra for command in commands for extra in re.findall(r"\"\.\[(\w+)\]\"", command)}
     called = {
-        node.args[0].value
+        node.args[position].value
         for tree in TREES.values()
         for node in ast.walk(tree)
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "install"
+        if isinstance(node, ast.Call)
+        and (position := EXTRAS.get(getattr(node.func, "id", ""))) is not None
+        and isinstance(node.args[position], ast.Constant)
     }
     assert called
     assert written | called <= set(project["optional-dependencies"])

@@ -33,22 +33,8 @@ def hook():
 
 
 @pytest.fixture
-def open_page(browser):
-    """Opens an address; fails at the end if the page logged an error."""
-    context = browser.new_context(viewport={"width": 600, "height": 600})
-    errors = []
-
-    def opened(address):
-        page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        page.goto(address)
-        wait_until(page, "window.player && player.stage.drawn > 0")
-        return page
-
-    yield opened
-    context.close()
-    assert not errors
+def open_page(visit):
+    return lambda address: visit(address, "window.player && player.stage.drawn > 0", 600, 600)
 
 
 def test_from_the_file_system_the_page_says_what_it_needs(hook, open_page, tmp_path):

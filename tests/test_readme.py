@@ -91,7 +91,7 @@ def test_python(block, make_dataset, workplace, monkeypatch):
     code = block.text
     for long, short in SMALLER.items():
         code = code.replace(long, short)
-    names = {"__name__": "snippet"}
+    names = {"__name__": "snippet", "__file__": block.file}
     monkeypatch.setitem(sys.modules, "snippet", ModuleType("snippet"))  # where dataclasses look types up
     exec(compile(code, block.document.name, "exec"), names)
     run_tests(names)

@@ -18,7 +18,8 @@ def test_the_version_is_the_same_everywhere():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     assert project["tool"]["hatch"]["version"]["path"] == "nmpm/_support/version.py"
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == __version__
-    assert re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[1] == __version__
+    versions = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert next(version for version in versions if version != "Unreleased") == __version__
 
 
 @pytest.mark.parametrize("path", TEMPLATES, ids=lambda path: path.stem)

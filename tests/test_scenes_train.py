@@ -5,7 +5,7 @@ import json
 import pytest
 
 from nmpm.cli import main
-from nmpm.data import catalog
+from nmpm.sim import load_preset
 
 
 @pytest.mark.parametrize(
@@ -32,7 +32,7 @@ def test_simulated_scenes_train_and_report(name, channels, tmp_path, monkeypatch
     assert main(["fit", *words]) == 0
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["dataset"] == f"{name}, simulated by nmpm"
-    assert channels <= set(catalog.scene(name).input_channels)
+    assert channels <= set(load_preset(name).scene.input_channels)
     assert len(report["per_trajectory"]["model"]) == 1
 
 

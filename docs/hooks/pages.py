@@ -20,6 +20,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from nmpm.cli import COMMANDS, main
+from nmpm.cli.command import summary
 from nmpm.emulator.engines import rules
 
 ROOT = Path(__file__).parents[2]
@@ -85,9 +86,9 @@ def generated_pages() -> dict[str, str]:
 def commands_page() -> str:
     """Help of all commands."""
     sections = [f"# Commands\n\n{_block(help_of())}"]
-    for name, (_, summary) in COMMANDS.items():
+    for name in COMMANDS:
         short = name in TRAINING and name != "fit"  # as fit
-        sections.append(f"## nmpm {name}\n\n{_training(summary) if short else _block(help_of(name))}")
+        sections.append(f"## nmpm {name}\n\n{_training(summary(COMMANDS[name])) if short else _block(help_of(name))}")
         if name == "zoo":
             sections += [f"### nmpm zoo {action}\n\n{_block(help_of(name, action))}" for action in ZOO]
     return "\n\n".join(sections)
@@ -168,8 +169,8 @@ def public_names(room: str) -> list[str]:
     return [name for name in import_module(room).__all__ if not name.startswith("_")]
 
 
-def _training(summary: str) -> str:
-    return f"{summary} Its options are those of `nmpm fit`, and of the [configuration](configuration.md)."
+def _training(sentence: str) -> str:
+    return f"{sentence} Its options are those of `nmpm fit`, and of the [configuration](configuration.md)."
 
 
 def _block(text: str) -> str:

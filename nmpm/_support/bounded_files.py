@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import re
 import struct
@@ -90,6 +91,22 @@ def check_within(path: Path, other: Path) -> None:
     """Refuses, with a DataError, another file that a file names and that is not in its folder or a folder there."""
     if not other.resolve().is_relative_to(path.parent.resolve()):
         raise DataError(f"{path}: it names {one_line(other)}, which is not in its folder. Copy it there.")
+
+
+def is_gzip(path: Path) -> bool:
+    """Whether a file is gzipped, by its first bytes."""
+    with path.open("rb") as file:
+        return file.read(2) == b"\x1f\x8b"
+
+
+def starts_with(path: Path, signature: bytes) -> bool:
+    """Whether a file, gzipped or not, begins with some bytes; damaged files do not."""
+    try:
+        check_regular(path)
+        with gzip.open(path) if is_gzip(path) else path.open("rb") as file:
+            return file.read(len(signature)) == signature
+    except (OSError, EOFError, zlib.error, DataError):
+        return False
 
 
 def read_bounded(path: Path, limit: int) -> bytes:

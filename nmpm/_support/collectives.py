@@ -48,24 +48,6 @@ def gather_to_rank0(value: T) -> list[T]:
     return values or []  # type: ignore[return-value]  # (likewise)
 
 
-def broadcast_from_rank0(value: float, device: torch.device) -> float:
-    """Rank 0's value, on every rank; exchanged on `device`, and read back from it."""
-    if rank_and_world_size()[1] == 1:
-        return value
-    message = torch.tensor(value, dtype=torch.float32, device=device)
-    distributed.broadcast(message, src=0)
-    return float(message)
-
-
-def any_rank(condition: bool, device: torch.device) -> bool:
-    """Whether the condition holds on any rank (`all_reduce`); exchanged on `device`, and read back from it."""
-    if rank_and_world_size()[1] == 1:
-        return condition
-    count = torch.tensor(int(condition), device=device)
-    distributed.all_reduce(count)
-    return bool(count)
-
-
 def global_mean(mean: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
     """A mean over this rank's `count` particles as part of the mean over those of all ranks (`all_reduce`).
 

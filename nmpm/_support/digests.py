@@ -21,8 +21,3 @@ def weights_digest(weights: Mapping[str, Tensor]) -> str:
 def float32_digest(weights: Mapping[str, Tensor]) -> str:
     """`weights_digest` in float32: the same after a test in another precision than the training's."""
     return weights_digest({k: v.float() if v.is_floating_point() else v for k, v in weights.items()})
-
-
-def short_digest(weights: Mapping[str, Tensor]) -> str:
-    """The first 12 digits of `weights_digest`, for tables."""
-    return weights_digest(weights)[:12]

@@ -25,7 +25,7 @@ import numpy as np
 
 from nmpm import errors
 from nmpm._support.bounded_files import expansion_limit
-from nmpm._support.memory import free_memory
+from nmpm._support.machine import free_memory
 from nmpm._support.messages import one_line
 from nmpm.errors import DataError, NmpmError
 
@@ -68,33 +68,19 @@ def iterate_isolated(function: Callable[..., Any], path: Path, *arguments: Any) 
     request = [f"{function.__module__}:{function.__name__}", str(path), list(arguments), limit]
     idle = _idle_children(os.getpid())
     child = idle.pop() if idle else _Child()
-    while child.is_about_to_end() or not child.send(request):
+    if child.may_end():
         child.end()
         child = _Child()
-    waits = False  # for the next call
     try:
-        while True:
-            kind, content = child.receive(path)
-            waits = kind == "end"
-            if waits:
-                return
-            waits = kind == "value"
+        kind, content = child.ask(request, path)
+        while kind == "item":
             yield content
-            if waits:
-                return
-            child.send("next")
-    except GeneratorExit:
-        waits = waits or (child.send("stop") and child.receive(path)[0] == "end")
-        raise
-    except NmpmError:
-        waits = child.process.poll() is None
-        raise
+            kind, content = child.ask([], path)
     finally:
-        if waits:
-            child.last_used = time.monotonic()
-            idle.append(child)
-        else:
+        if child.is_busy:
             child.end()
+        else:
+            idle.append(child)
 
 
 @cache
@@ -106,71 +92,69 @@ class _Child:
     """A child process, started."""
 
     def __init__(self) -> None:
-        known = os.pathsep.join(path for path in sys.path if path)
-        process = subprocess.Popen(  # noqa: S603 (this interpreter)
+        folders = os.pathsep.join(path for path in sys.path if path)
+        self._process = subprocess.Popen(  # noqa: S603 (this interpreter)
             [sys.executable, "-P", "-c", _START],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-            env=os.environ | _ENVIRONMENT | {"PYTHONPATH": known},
+            env=os.environ | _ENVIRONMENT | {"PYTHONPATH": folders},
             pipesize=_PIPE_BYTES,
             start_new_session=True,  # Ctrl-C is its parent's
         )
-        self.process, self._requests, self._answers = process, cast(BinaryIO, process.stdin), cast(Any, process.stdout)
-        self.last_used = time.monotonic()
+        self.is_busy, self._last_used = False, time.monotonic()
 
-    def is_about_to_end(self) -> bool:
-        """Whether it may end before it reads the next request, as it has been idle."""
-        return time.monotonic() - self.last_used > _IDLE_SECONDS / 2
+    def may_end(self) -> bool:
+        """Whether it has ended, or may before it reads the next request, as it has been idle."""
+        return self._process.poll() is not None or time.monotonic() - self._last_used > _IDLE_SECONDS / 2
 
-    def send(self, message: Any) -> bool:
-        """Send a line; False if the process has ended."""
-        try:
-            self._requests.write(json.dumps(message).encode() + b"\n")
-            self._requests.flush()
-        except OSError:
-            self.end()
-            return False
-        return self.process.poll() is None
-
-    def receive(self, path: Path) -> tuple[str, Any]:
-        """The next answer: an "item" that the function yielded, its "end", or the "value" that it returned.
+    def ask(self, request: list[Any], path: Path) -> tuple[str, Any]:
+        """The answer to a call, or to an empty request for its next item: an "item", or the "end".
 
         Raises:
             NmpmError: that the function raised.
             DataError: if the process ended.
         """
+        self.is_busy = True
+        requests, answers = cast(BinaryIO, self._process.stdin), cast(BinaryIO, self._process.stdout)
         try:
-            kind, content = _read_message(self._answers)
+            requests.write(json.dumps(request).encode() + b"\n")
+            requests.flush()
+            kind, content = _read_message(answers)
         except (OSError, EOFError, ValueError) as error:
-            raise DataError(f"{path}: cannot be read: {self._how_it_ended()} Is it complete? Copy it again.") from error
-        if kind in ("item", "end", "value"):
+            status = self.end()
+            name = signal.Signals(-status).name if status < 0 else f"status {status}"
+            raise DataError(
+                f"{path}: cannot be read: its parser ended ({name}): it is damaged, or asks for more memory than its"
+                " size allows. Is it complete? Copy it again."
+            ) from error
+        self.is_busy, self._last_used = False, time.monotonic()
+        if kind in ("item", "end"):
             return kind, content
         raise getattr(errors, kind)(content)
 
-    def _how_it_ended(self) -> str:
-        status = self.process.wait()
-        name = signal.Signals(-status).name if status < 0 else f"status {status}"
-        return f"its parser ended ({name}): it is damaged, or asks for more memory than its size allows."
-
-    def end(self) -> None:
-        """End the process."""
-        with suppress(OSError):
-            self.process.kill()
-        for stream in (self._requests, self._answers):
+    def end(self) -> int:
+        """End the process; its status, its own if it ends by itself where nobody asks or listens any more."""
+        for stream in (self._process.stdin, self._process.stdout):
             with suppress(OSError):
-                stream.close()
-        self.process.wait()
+                cast(BinaryIO, stream).close()
+        with suppress(subprocess.TimeoutExpired):
+            return self._process.wait(1.0)
+        self._process.kill()
+        return self._process.wait()
 
 
 def serve() -> None:
-    """Run the calls that come by standard input; answer by standard output, which parsers cannot write to."""
+    """Answer the requests that come by standard input; by standard output, which parsers cannot write to."""
     requests = os.fdopen(os.dup(0), "rb", buffering=0)
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
+    path, items = "", iter(())
     with suppress(BrokenPipeError):
         while line := _next_request(requests):
-            _answer(json.loads(line), requests, answers)
+            if request := json.loads(line):
+                path, items = request[1], _call(*request)
+            _write_message(answers, *_answer(path, items))
 
 
 def _next_request(requests: BinaryIO) -> bytes:
@@ -183,26 +167,24 @@ def _next_request(requests: BinaryIO) -> bytes:
     return requests.readline()
 
 
-def _answer(request: tuple[str, str, list[Any], int], requests: BinaryIO, answers: BinaryIO) -> None:
-    name, path, arguments, limit = request
+def _call(name: str, path: str, arguments: list[Any], limit: int) -> Iterator[Any]:
+    """What a function of this package yields, or the one value that it returns."""
+    _limit_memory(limit)
     module, _, function = name.partition(":")
+    result = getattr(import_module(module), function)(Path(path), *arguments)
+    yield from result if isinstance(result, Iterator) else [result]
+
+
+def _answer(path: str, items: Iterator[Any]) -> tuple[str, Any]:
     try:
-        _limit_memory(limit)
-        result = getattr(import_module(module), function)(Path(path), *arguments)
-        if not isinstance(result, Iterator):
-            _write_message(answers, "value", result)
-            return
-        for item in result:
-            _write_message(answers, "item", item)
-            if json.loads(requests.readline() or '"stop"') == "stop":
-                break
+        for item in items:
+            return "item", item
     except NmpmError as error:
-        _write_message(answers, type(error).__name__, str(error))
+        return type(error).__name__, str(error)
     except Exception as error:  # damaged files may make a parser raise anything
         reason = one_line(error, 300) or type(error).__name__
-        _write_message(answers, "DataError", f"{path}: cannot be read ({reason}). Is it complete? Copy it again.")
-    else:
-        _write_message(answers, "end", None)
+        return "DataError", f"{path}: cannot be read ({reason}). Is it complete? Copy it again."
+    return "end", None
 
 
 def _limit_memory(extra: int) -> None:

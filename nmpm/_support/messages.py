@@ -8,7 +8,10 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+from importlib.util import find_spec
 from typing import Any, TextIO
+
+from nmpm.errors import ConfigError
 
 
 def one_line(text: object, limit: int = 200) -> str:
@@ -25,6 +28,12 @@ def counted(count: int, noun: str) -> str:
 def install(extra: str) -> str:
     """The command that installs an optional dependency, such as `pip install -e ".[play]"`."""
     return f'pip install -e ".[{extra}]" in the clone of nmpm'
+
+
+def require(module: str, extra: str, purpose: str) -> None:
+    """Raise ConfigError, naming the purpose and the extra, if an optional dependency is not installed."""
+    if find_spec(module) is None:
+        raise ConfigError(f"{purpose} needs {module}, which is not installed: {install(extra)}.")
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

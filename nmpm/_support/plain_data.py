@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import operator
 import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -25,7 +26,6 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeGuard, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from nmpm._support.messages import one_line, suggestion
-from nmpm._support.numbers import is_finite
 from nmpm.errors import ConfigError
 
 T = TypeVar("T")
@@ -175,7 +175,7 @@ def _read(plain: Any, kind: Any, key: str, where: str) -> Any:
         return from_plain(section, value, f"{where}, {key}")
     if isinstance(value, tuple) and get_origin(kind) is tuple and _is_section(section := get_args(kind)[0]):
         return tuple(from_plain(section, item, f"{where}, {key}") for item in value)
-    if not _fits(value, kind):
+    if not fits(value, kind):
         raise ConfigError(f"{where}: {key} = {one_line(repr(plain), 80)} should be {_describe(kind)}.")
     return value
 
@@ -196,16 +196,16 @@ def _is_section(kind: Any) -> TypeGuard[type]:
     return isinstance(kind, type) and dataclasses.is_dataclass(kind) and not inspect.isabstract(kind)
 
 
-def _fits(value: Any, kind: Any) -> bool:
+def fits(value: Any, kind: Any) -> bool:
     """Whether a value is of an annotated kind; kinds that are none of plain data take all."""
     options, origin, inner = _options(kind), get_origin(kind), get_args(kind)
     if len(options) > 1:
-        return any(_fits(value, option) for option in options)
+        return any(fits(value, option) for option in options)
     if origin is Literal:
         return (type(value), value) in [(type(choice), choice) for choice in inner]  # 1 == 1.0 == True
     if origin is tuple:
         kinds = inner[:1] * len(value) if isinstance(value, tuple) and inner[-1] is ... else inner
-        return isinstance(value, tuple) and len(value) == len(kinds) and all(map(_fits, value, kinds))
+        return isinstance(value, tuple) and len(value) == len(kinds) and all(map(fits, value, kinds))
     if kind is float:
         return is_finite(value)
     if kind is int:
@@ -223,3 +223,28 @@ def _describe(kind: Any) -> str:
     if origin is tuple:
         return f"a list, each {_describe(inner[0])}" if inner[-1] is ... else f"[{', '.join(map(_describe, inner))}]"
     return _WORDS.get(kind, "keys and values")
+
+
+def is_number(value: object) -> TypeGuard[int | float]:
+    """Whether a value is a number, and no truth value."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def is_finite(value: object) -> TypeGuard[int | float]:
+    """Whether a value is a number, no truth value, and finite in float64."""
+    return is_number(value) and -sys.float_info.max <= value <= sys.float_info.max
+
+
+def check_whole(name: str, value: Any, least: int) -> int:
+    """An argument that must be a whole number of at least `least`; NumPy's are taken too.
+
+    Raises:
+        ConfigError: naming the argument and its value.
+    """
+    try:
+        number = least - 1 if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = least - 1
+    if number < least:
+        raise ConfigError(f"{name} = {one_line(repr(value), 60)}: it must be a whole number, at least {least}.")
+    return number

@@ -8,9 +8,14 @@ from pathlib import Path
 
 from nmpm._support.messages import suggestion
 from nmpm.errors import ConfigError, DataError
+from nmpm.registry import Registry
 
 PACKAGE = Path(__file__).parents[1]
 """The folder of the package."""
+SCENES: Registry[Path] = Registry(
+    "nmpm.scenes", "scene", {path.stem: path for path in sorted((PACKAGE / "sim" / "presets").glob("*.yaml"))}
+)
+"""YAML files of the presets of simulators, by name; another package's entry point names a `Path`."""
 
 
 def shipped_folder(folder: str) -> Path:
@@ -43,32 +48,28 @@ def entry_names(zoo: Path) -> list[str]:
 
 
 def preset_names() -> tuple[str, ...]:
-    """Names of the shipped presets of simulators, which are those of the embedded datasets."""
-    return tuple(sorted(path.stem for path in (PACKAGE / "sim" / "presets").glob("*.yaml")))
+    """Names of the presets of simulators, which are those of the embedded datasets."""
+    return tuple(SCENES)
 
 
 def check_dataset(name: str) -> None:
     """Raise DataError if no embedded dataset has the name."""
-    if name not in preset_names():
+    if name not in SCENES:
         raise DataError(
-            f"No embedded dataset is called {name!r}; known: {', '.join(preset_names())}. For your own data, give"
-            " the path of their folder."
+            f"No embedded dataset is called {name!r}; known: {', '.join(SCENES)}.{suggestion(name, SCENES)} For"
+            " your own data, give the path of their folder."
         )
 
 
 def find_preset(name: str | Path) -> Path:
-    """The file of a preset: the shipped one of that name, else a file that exists.
-
-    Raises:
-        ConfigError: if there is neither.
-    """
-    names = preset_names()
-    path = PACKAGE / "sim" / "presets" / f"{name}.yaml" if str(name) in names else Path(name)
-    if not path.is_file():
-        raise ConfigError(
-            f"There is no preset or file {name}; shipped presets: {', '.join(names)}.{suggestion(str(name), names)}"
-        )
-    return path
+    """The file of a preset: the one of that name, else a file that exists; ConfigError if there is neither."""
+    if str(name) in SCENES:
+        return SCENES[str(name)]
+    if Path(name).is_file():
+        return Path(name)
+    raise ConfigError(
+        f"There is no preset or file {name}; presets: {', '.join(SCENES)}.{suggestion(str(name), SCENES)}"
+    )
 
 
 def config_names() -> list[str]:
@@ -78,17 +79,12 @@ def config_names() -> list[str]:
 
 
 def find_config(name: str) -> Path:
-    """The configuration file that a `--config` means: a file that exists, else the shipped one of that name.
-
-    Raises:
-        ConfigError: if there is neither.
-    """
-    given = Path(name)
-    if given.is_file():
-        return given
-    if name in config_names():
-        return shipped_folder("configs") / name
+    """The file that a `--config` means: one that exists, else the shipped one of that name; ConfigError if neither."""
     names = config_names()
+    if Path(name).is_file():
+        return Path(name)
+    if name in names:
+        return shipped_folder("configs") / name
     raise ConfigError(
         f"--config {name}: there is no such file here, and the shipped configurations are"
         f" {', '.join(names)}.{suggestion(name, names)}"

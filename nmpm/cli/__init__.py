@@ -5,36 +5,41 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from difflib import get_close_matches
-from importlib import import_module
 
 from nmpm._support.messages import plain_warnings, unfailing_output
 from nmpm._support.threads import limit_spinning
 from nmpm._support.version import __version__
+from nmpm.cli.command import Command, run_command, summary
 from nmpm.errors import NmpmError
+from nmpm.registry import Registry
 
-COMMANDS = {
-    "fit": ("nmpm.cli.training", "Train an emulator, then test the best checkpoint once."),
-    "validate": ("nmpm.cli.training", "Roll a checkpoint out over the valid split."),
-    "test": ("nmpm.cli.training", "Roll a checkpoint out over the test split; write table, picture and animation."),
-    "predict": ("nmpm.cli.training", "Roll a checkpoint out over the test split and write the trajectories."),
-    "simulate": ("nmpm.cli.simulate", "Simulate a dataset of one of the shipped scenes, or of one's own."),
-    "convert": ("nmpm.cli.convert", "Convert a dataset of another format to the native layout."),
-    "init": ("nmpm.cli.init", "Write a configuration for a dataset, chosen by what its trajectories show."),
-    "inspect": ("nmpm.cli.inspect", "Summarise a dataset on one screen, with anything odd about it."),
-    "zoo": ("nmpm.cli.zoo", "List the pretrained models, find one for your data, or add a finished run."),
-    "demo": ("nmpm.cli.demo", "Show a model beside the simulator that it learned from: times, error, a page."),
-    "rollout": ("nmpm.cli.rollout", "Roll a pretrained model out and write the trajectories."),
-    "stress": ("nmpm.cli.stress", "Test a model at the extremes: pass or fail, with measured margins."),
-    "compare": ("nmpm.cli.compare", "Compare models on scenes that need not be their own."),
-    "trade": ("nmpm.cli.trade", "Measure time and errors of models, the simulator and trivial predictors."),
-    "export": ("nmpm.cli.export", "Write a model as a file that runs without nmpm: ONNX, or AOTInductor's."),
-    "render": ("nmpm.cli.render", "Draw trajectories as PNG and GIF or MP4."),
-    "play": ("nmpm.cli.play", "Throw and pour in a browser, while a pretrained model predicts."),
-    "view": ("nmpm.cli.view", "Write a page that plays trajectories in a browser."),
-    "doctor": ("nmpm.cli.doctor", "Report on the installation and test it, for help with problems."),
-}
+COMMANDS: Registry[type[Command]] = Registry(
+    "nmpm.commands",
+    "command",
+    {
+        "fit": "nmpm.cli.training:Fit",
+        "validate": "nmpm.cli.training:Validate",
+        "test": "nmpm.cli.training:Test",
+        "predict": "nmpm.cli.training:Predict",
+        "simulate": "nmpm.cli.simulate:Simulate",
+        "convert": "nmpm.cli.convert:Convert",
+        "init": "nmpm.cli.init:Init",
+        "inspect": "nmpm.cli.inspect:Inspect",
+        "zoo": "nmpm.cli.zoo:ZooCommands",
+        "demo": "nmpm.cli.demo:Demo",
+        "rollout": "nmpm.cli.rollout:RollOut",
+        "stress": "nmpm.cli.measure:Stress",
+        "compare": "nmpm.cli.measure:Compare",
+        "trade": "nmpm.cli.measure:Trade",
+        "export": "nmpm.cli.export:Export",
+        "render": "nmpm.cli.pages:Render",
+        "play": "nmpm.cli.pages:Play",
+        "view": "nmpm.cli.pages:View",
+        "doctor": "nmpm.cli.doctor:Doctor",
+    },
+)
 
 USAGE = """usage: nmpm COMMAND [OPTIONS]
 
@@ -78,12 +83,23 @@ def usage() -> str:
     width = max(40, shutil.get_terminal_size().columns)
     lines = [
         textwrap.fill(summary, width, initial_indent=f"  {name:<10} ", subsequent_indent=" " * 13)
-        for name, (_, summary) in COMMANDS.items()
+        for name, summary in summaries().items()
     ]
     configs = textwrap.fill(
         ", ".join(config_names()), width, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False
     )
     return USAGE.format(commands="\n".join(lines), configs=configs)
+
+
+def summaries() -> dict[str, str]:
+    """What each command does, in a sentence; of one that cannot be imported, why."""
+    lines = dict[str, str]()
+    for name in COMMANDS:
+        try:
+            lines[name] = summary(COMMANDS[name])
+        except NmpmError as error:
+            lines[name] = str(error)
+    return lines
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -112,14 +128,13 @@ def _main(words: list[str]) -> int:
         sys.stdout.write(f"nmpm {__version__}\n")
         return 0
     if words[0] not in COMMANDS:
-        near = get_close_matches(words[0], COMMANDS, n=1)
+        near = get_close_matches(words[0], list(COMMANDS), n=1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(COMMANDS)}."
         sys.stderr.write(f"nmpm: there is no command {words[0]!r}; {hint} See nmpm --help.\n")
         return 2
     try:
         with plain_warnings():
-            command: Callable[[list[str]], int | None] = import_module(COMMANDS[words[0]][0]).run
-            return command(words) or 0
+            return run_command(COMMANDS[words[0]], f"nmpm {words[0]}", words[1:]) or 0
     except NmpmError as error:
         sys.stderr.write(f"nmpm {words[0]}: {error}\n")
         return error.exit_status

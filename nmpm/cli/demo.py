@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import dataclasses
 import os
@@ -10,18 +9,12 @@ import shlex
 import sys
 import time
 import webbrowser
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.options import (
-    MODEL,
-    CommandParser,
-    add_device_option,
-    check_at_least,
-    check_device,
-    check_model,
-    check_output,
-)
+from nmpm.cli.command import positional
+from nmpm.cli.options import DeviceOptions, Natural, Positive, check_model, check_output
 from nmpm.errors import ConfigError, UnstableError
 
 if TYPE_CHECKING:
@@ -36,104 +29,102 @@ if TYPE_CHECKING:
 
 DEFAULT = "dambreak2d"
 """The model of a demonstration that names none."""
-FRAMES = 200
-"""Of a demonstration, unless an option says otherwise."""
-
-_EXAMPLES = """\
-examples:
-  nmpm demo                                a dam break: the simulator, and its model
-  nmpm demo waterramps --seed 3            water and ramps, another scene
-  nmpm demo goop --frames 400 --out goop   goop.h5 and goop.html
-"""
 
 
-def run(words: list[str]) -> None:
-    """Run the command, e.g. ["demo", "waterramps"]."""
-    options = _parser().parse_args(words[1:])
-    for name, least in (("frames", 1), ("seed", 0)):
-        check_at_least(f"--{name}", getattr(options, name), least)
-    stem = options.out or Path(f"{Path(options.model).name}-demo")
-    file, page = (stem.with_name(f"{stem.name}{suffix}") for suffix in (".h5", ".html"))
-    for path in (file, page):
-        check_output("--out", path)
-    check_model(options.model)
-    _check_simulated(options.model)
-    check_device(options.device)
-    from nmpm._support.devices import device_name
-    from nmpm._support.messages import counted
-    from nmpm.cli.options import choose_threads
-    from nmpm.cli.prediction import predicted, timed_rollout
-    from nmpm.data.format import Split, write_split
-    from nmpm.emulator.monitor import Monitor, Policy
-    from nmpm.evaluation.machine import clock_for
-    from nmpm.evaluation.prediction_errors import squared_errors
-    from nmpm.evaluation.trade.ranking import Setting
-    from nmpm.sim.predictability import twin_of
-    from nmpm.viz.files import read_labelled
-    from nmpm.viz.viewer import ViewerPage
-    from nmpm.zoo import load_model
-    from nmpm.zoo.scenes import scene_window, training_preset
+@dataclass(frozen=True, kw_only=True)
+class Demo(DeviceOptions):
+    """Show a model beside the simulator that it learned from: times, error, a page.
 
-    model = load_model(options.model, options.device)
-    preset = training_preset(model)
-    if preset is None:
-        raise ConfigError(_no_simulator(options.model))
-    choose_threads(model, 1)  # as many as the simulator's
-    sys.stdout.write(f"Scene of {preset.name}, seed {options.seed}; simulator: {preset.generator}.\n")
-    simulated, slow = _simulate(preset, options.seed, options.frames + 1)
-    window = scene_window(model, simulated)
-    clock, read_clock = clock_for(model.emulator.device)
-    watch = Monitor(Policy.RECORD)
-    rollout, fast = timed_rollout(model, window.initial, options.frames, watch, clock=read_clock)
-    error = float(squared_errors(window, rollout.position).mean())
-    settings = [Setting("its shipped setting", slow, 0.0)]
-    for substeps in sorted({preset.stable_substeps, twin_of(preset).substeps}):
-        if substeps < preset.substeps:
-            fewer = dataclasses.replace(preset, substeps=substeps)
-            with contextlib.suppress(UnstableError):
-                again, taken = _simulate(fewer, options.seed, options.frames + 1)
-                off = float(squared_errors(window, scene_window(model, again).target).mean())
-                settings.append(Setting(f"{counted(substeps, 'substep')} instead of {preset.substeps}", taken, off))
-    _print_times(settings, error, fast, f"{clock} on {device_name(model.emulator.device, 1)}")
-    _print_errors(model.scene, window, rollout)
-    write_split(file, [predicted(model, options.model, model.scene, window.initial, rollout, window)])
-    ViewerPage(read_labelled(Split(file))).write(page)
-    shown = "opened in the browser" if options.open and _open(page) else "open it in a browser"
-    sys.stdout.write(
-        f"wrote {page}: {shown}. The positions are in {file}: nmpm render {shlex.quote(str(file))} makes a film.\n"
-    )
+    It draws a scene as those that a model learned from, simulates it, emulates it, prints both times and the error, and
+    shows both in a browser.
 
+    Args:
+        model: A model of the zoo (see nmpm zoo list); a path: a run, a checkpoint, or an entry's folder; or an id of
+            the Hugging Face hub, owner/repository@revision.
+        seed: Of the scene (default: 0).
+        frames: Frames to predict.
+        out: Path of both files without suffix (default: MODEL-demo).
+        no_open: Write the page, but do not open it.
+        device: Of the model: auto, cpu, cuda or mps; cuda:1 for the second GPU.
 
-def _no_simulator(model: str) -> str:
-    return (
-        f"{model} was not trained on scenes of a shipped simulator, so there is none to set beside it."
-        f" nmpm rollout {model} shows what it predicts; nmpm demo {DEFAULT} has a simulator."
-    )
+    Examples:
+        nmpm demo                                a dam break: the simulator, and its model
+        nmpm demo waterramps --seed 3            water and ramps, another scene
+        nmpm demo goop --frames 400 --out goop   goop.h5 and goop.html
+    """
 
+    model: str = positional(DEFAULT)
+    seed: Natural = 0
+    frames: Positive = 200
+    out: Path | None = None
+    no_open: bool = False
 
-def _check_simulated(name: str) -> None:
-    """Raise ConfigError, before torch is imported, for a model of the zoo whose card names no simulator."""
-    from nmpm.zoo.card import preset_of
-    from nmpm.zoo.registry import Zoo
+    def __post_init__(self) -> None:
+        for path in self._files:
+            check_output("--out", path)
+        check_model(self.model)
+        from nmpm.zoo.card import preset_of
+        from nmpm.zoo.registry import Zoo
 
-    if name in Zoo.list() and preset_of(Zoo.card(name)) is None:
-        raise ConfigError(_no_simulator(name))
+        if self.model in Zoo.list() and preset_of(Zoo.card(self.model)) is None:
+            raise self._no_simulator()
+        super().__post_init__()
 
+    @property
+    def _files(self) -> tuple[Path, Path]:
+        stem = self.out or Path(f"{Path(self.model).name}-demo")
+        return stem.with_name(f"{stem.name}.h5"), stem.with_name(f"{stem.name}.html")
 
-def _parser() -> argparse.ArgumentParser:
-    parser = CommandParser(
-        prog="nmpm demo",
-        description="Draw a scene as those that a model learned from, simulate it, emulate it, print both times and the"
-        " error, and show both in a browser.",
-        epilog=_EXAMPLES,
-    )
-    parser.add_argument("model", nargs="?", default=DEFAULT, help=f"{MODEL} (default: {DEFAULT})")
-    parser.add_argument("--seed", type=int, default=0, help="of the scene (default: 0)")
-    parser.add_argument("--frames", type=int, default=FRAMES, help=f"frames to predict (default: {FRAMES})")
-    parser.add_argument("--out", type=Path, help="path of both files without suffix (default: MODEL-demo)")
-    parser.add_argument("--no-open", dest="open", action="store_false", help="write the page, but do not open it")
-    add_device_option(parser, "of the model: ")
-    return parser
+    def _no_simulator(self) -> ConfigError:
+        return ConfigError(
+            f"{self.model} was not trained on scenes of a shipped simulator, so there is none to set beside it."
+            f" nmpm rollout {self.model} shows what it predicts; nmpm demo {DEFAULT} has a simulator."
+        )
+
+    def run(self) -> None:
+        from nmpm._support.machine import device_name
+        from nmpm._support.messages import counted
+        from nmpm.cli.options import choose_threads
+        from nmpm.cli.prediction import Start
+        from nmpm.data.format import Split, write_split
+        from nmpm.emulator.monitor import Monitor, Policy
+        from nmpm.evaluation.machine import clock_for
+        from nmpm.evaluation.prediction_errors import squared_errors
+        from nmpm.evaluation.trade.ranking import Setting
+        from nmpm.sim.preset import twin_of
+        from nmpm.viz.files import read_labelled
+        from nmpm.viz.viewer import ViewerPage
+        from nmpm.zoo import load_model
+        from nmpm.zoo.scenes import scene_window, training_preset
+
+        (file, page), model = self._files, load_model(self.model, self.device)
+        preset = training_preset(model)
+        if preset is None:
+            raise self._no_simulator()
+        choose_threads(model, 1)  # as many as the simulator's
+        sys.stdout.write(f"Scene of {preset.name}, seed {self.seed}; simulator: {preset.generator}.\n")
+        simulated, slow = _simulate(preset, self.seed, self.frames + 1)
+        window = scene_window(model, simulated)
+        clock, read_clock = clock_for(model.emulator.device)
+        start = Start(model, model.scene, window.initial, window.initial, window)
+        rollout, fast = start.predict(self.frames, Monitor(Policy.RECORD), read_clock)
+        error = float(squared_errors(window, rollout.position).mean())
+        settings = [Setting("its shipped setting", slow, 0.0)]
+        for substeps in sorted({preset.stable_substeps, twin_of(preset).substeps}):
+            if substeps < preset.substeps:
+                fewer = dataclasses.replace(preset, substeps=substeps)
+                with contextlib.suppress(UnstableError):
+                    again, taken = _simulate(fewer, self.seed, self.frames + 1)
+                    off = float(squared_errors(window, scene_window(model, again).target).mean())
+                    settings.append(Setting(f"{counted(substeps, 'substep')} instead of {preset.substeps}", taken, off))
+        _print_times(settings, error, fast, f"{clock} on {device_name(model.emulator.device, 1)}")
+        _print_errors(model.scene, window, rollout)
+        write_split(file, [start.trajectory(self.model, rollout)])
+        ViewerPage(read_labelled(Split(file))).write(page)
+        shown = "opened in the browser" if not self.no_open and _open(page) else "open it in a browser"
+        sys.stdout.write(
+            f"wrote {page}: {shown}. The positions are in {file}: nmpm render {shlex.quote(str(file))} makes a film.\n"
+        )
 
 
 def _simulate(preset: Preset, seed: int, frames: int) -> tuple[Trajectory, float]:
@@ -163,7 +154,7 @@ def _print_times(settings: Sequence[Setting], error: float, fast: float, where: 
         fast: Milliseconds per frame of the emulator.
         where: Its clock and device.
     """
-    from nmpm._support.devices import device_name, find_device
+    from nmpm._support.machine import device_name, find_device
     from nmpm.evaluation.trade.ranking import at_equal_error
 
     cpu = device_name(find_device("cpu"), 1)

@@ -5,65 +5,75 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nmpm.cli.options import CommandParser, add_data_options, check_exists, check_output, data_options
+from nmpm.cli.command import option
+from nmpm.cli.options import Existing, FactOptions, check_output
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
     from nmpm.data.convert import Options
 
 MINUTES = 15.0
-_DESCRIPTION = """\
-Write a configuration for a dataset of any format that nmpm convert reads, to train on it by nmpm fit.
-
-What the trajectories show is written beside each value: how many particles an occupied cell has, whether energy comes
-in, whether scenes come to rest, how gravity and walls were found and how sure that is. The rules are those of the
-shipped configurations (docs/recipes.md); the speed of this machine is measured for a second.
-"""
-_EXAMPLES = """\
-examples:
-  nmpm init grains                              writes grains.yaml; look at it, then:
-  nmpm fit --config grains.yaml                 train, test, draw
-  nmpm init run.npz --out long.yaml --minutes 120
-                                                a finer grid for a longer training
-  nmpm init grains --gravity 0,-9.81            what you know better than the data show
-  nmpm fit --data.path grains                   all at once, into runs/grains
-
-Names of types and the time step are no part of a configuration; they go into a copy of the data:
-  nmpm convert grains NEW --types 1=steel,2=glass --dt 0.004
-  nmpm init NEW
-"""
 _SHOWN = ("max_steps:", "cells:", "constraints:", "gravity:", "# dt ")
 """Beginnings of the lines that `nmpm fit` prints of a configuration."""
 
 
-def run(words: list[str]) -> None:
-    """Run the command, e.g. ["init", "grains"]."""
-    parser = CommandParser(prog="nmpm init", description=_DESCRIPTION, epilog=_EXAMPLES)
-    parser.add_argument("path", type=Path, help="a dataset, of any format that nmpm convert reads")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: NAME.yaml)")
-    parser.add_argument("--minutes", type=float, default=MINUTES, help="of the training (default: 15)")
-    add_data_options(parser)
-    arguments = parser.parse_args(words[1:])
-    options = data_options(arguments)
-    for name in ("types", "static", "dt"):
-        if getattr(options, name) is not None:
-            raise ConfigError(
-                f"--{name}: a configuration cannot state it; write it into a copy of the data: nmpm convert"
-                f" {arguments.path} NEW --{name} {getattr(arguments, name)}, then nmpm init NEW."
-            )
-    if not arguments.minutes > 0:
-        raise ConfigError(f"--minutes {arguments.minutes:g}: it must be positive.")
-    check_exists("PATH", arguments.path)
-    name = dataset_name(arguments.path)
-    out = arguments.out or Path(f"{name}.yaml")
-    if out.exists():
-        raise ConfigError(f"{out} exists already: delete it, or choose another file with --out.")
-    check_output("--out", out)
-    _write(arguments.path, options, out, f"runs/{name}", arguments.minutes)
-    sys.stdout.write(f"wrote {out}; to train by it: nmpm fit --config {shlex.quote(str(out))}\n")
+@dataclass(frozen=True, kw_only=True)
+class Init(FactOptions):
+    """Write a configuration for a dataset, chosen by what its trajectories show.
+
+    The dataset may be of any format that nmpm convert reads; nmpm fit trains on it by the configuration.
+
+    What the trajectories show is written beside each value: how many particles an occupied cell has, whether energy
+    comes in, whether scenes come to rest, how gravity and walls were found and how sure that is. The rules are those
+    of the shipped configurations (docs/recipes.md); the speed of this machine is measured for a second.
+
+    Args:
+        path: A dataset, of any format that nmpm convert reads.
+        out: File to write (default: NAME.yaml).
+        minutes: Of the training.
+
+    Examples:
+        nmpm init grains                              writes grains.yaml; look at it, then:
+        nmpm fit --config grains.yaml                 train, test, draw
+        nmpm init run.npz --out long.yaml --minutes 120
+                                                      a finer grid for a longer training
+        nmpm init grains --gravity 0,-9.81            what you know better than the data show
+        nmpm fit --data.path grains                   all at once, into runs/grains
+
+        Names of types and the time step are no part of a configuration; they go into a copy of the data:
+
+        nmpm convert grains NEW --types 1=steel,2=glass --dt 0.004
+        nmpm init NEW
+    """
+
+    path: Existing
+    out: Path | None = option(metavar="FILE")
+    minutes: float = MINUTES
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for argument in self.arguments:
+            name, text = argument.split("=", 1)
+            if name in ("--types", "--static", "--dt"):
+                raise ConfigError(
+                    f"{name}: a configuration cannot state it; write it into a copy of the data: nmpm convert"
+                    f" {self.path} NEW {name} {text}, then nmpm init NEW."
+                )
+        if not self.minutes > 0:
+            raise ConfigError(f"--minutes {self.minutes:g}: it must be positive.")
+
+    def run(self) -> None:
+        name = dataset_name(self.path)
+        out = self.out or Path(f"{name}.yaml")
+        if out.exists():
+            raise ConfigError(f"{out} exists already: delete it, or choose another file with --out.")
+        check_output("--out", out)
+        _write(self.path, self.facts, out, f"runs/{name}", self.minutes)
+        sys.stdout.write(f"wrote {out}; to train by it: nmpm fit --config {shlex.quote(str(out))}\n")
 
 
 def write_for_fit(path: Path, options: Options, root: Path, minutes: float) -> Path:
@@ -84,14 +94,13 @@ def write_for_fit(path: Path, options: Options, root: Path, minutes: float) -> P
 def _write(path: Path, options: Options, out: Path, root: str, minutes: float) -> Sequence[str]:
     """Write a configuration for a dataset, and return its lines."""
     from nmpm._support.atomic import atomic_write
-    from nmpm.data.loading.sources import FolderSource
-    from nmpm.data.new_configuration import Choice, CompletedSource, render_configuration
+    from nmpm.data.new_configuration import CompletedSource, SettingsChoice
+    from nmpm.data.sources import FolderSource
     from nmpm.evaluation.pace import measure_machine
 
-    source, facts = CompletedSource.of(FolderSource(path, options)).look()
-    scene = source.data.scene
-    choice = Choice.of(scene, facts, measure_machine(scene.dim, minutes))
-    text = render_configuration(str(path), source, choice, root)
+    source = CompletedSource.of(FolderSource(path, options))
+    choice = SettingsChoice.of(source, measure_machine(source.data.scene.dim, minutes))
+    text = choice.configuration(str(path), root)
     with atomic_write(out) as part:
         part.write_text(text, encoding="utf-8")
     return text.splitlines()

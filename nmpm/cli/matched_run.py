@@ -10,15 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from jsonargparse import Namespace
-from jsonargparse.typing import PositiveInt
-from lightning.pytorch.cli import LightningArgumentParser
 
 from nmpm._support.plain_data import to_plain
-from nmpm.cli.early_checks import read_options, stated_keys
-from nmpm.cli.match_options import MATERIALS, STRICT, STRIDE, MatchOptions, describe
+from nmpm.cli.options import MatchOptions, describe
+from nmpm.cli.training import read_options, stated_keys
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.dataset import Dataset
-from nmpm.data.loading.sources import FolderSource
+from nmpm.data.sources import FolderSource
 from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.adaptation import adapted, with_members
 from nmpm.emulator.similarity import Match
@@ -30,24 +28,8 @@ from nmpm.zoo.matching import match_data
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.registry import load_model
 
-START_FROM = (
-    "Model that a new training starts with: a zoo name, a run or a checkpoint. Cells, network, transfer, decoder and"
-    " constraints are the model's."
-)
-MEMBERS = "Rollouts of each test scene, whose scores as an ensemble are reported, too: fair CRPS, spread over skill."
 FORM = (*COMPARED, "constraints", "particles_per_cell")
 """Arguments of --model.… that are the model's."""
-
-
-def add_arguments(parser: LightningArgumentParser, command: str) -> None:
-    """Add the options --materials, --stride and --strict, --start_from of trainings and --members of tests."""
-    for name, text in (("materials", MATERIALS), ("stride", STRIDE)):
-        parser.add_argument(f"--{name}", type=str | None, default=None, help=text)
-    parser.add_argument("--strict", type=bool, default=False, help=STRICT)
-    if command == "fit":
-        parser.add_argument("--start_from", type=str | None, default=None, help=START_FROM)
-    if command == "test":
-        parser.add_argument("--members", type=PositiveInt | None, default=None, help=MEMBERS)
 
 
 @dataclass(frozen=True)
@@ -71,7 +53,7 @@ class MatchedRun:
     chosen: Mapping[str, str] | None = None
 
     @classmethod
-    def of(cls, config: Namespace, checkpoint: Path | None) -> MatchedRun | None:
+    def of(cls, config: Namespace, given: MatchOptions, checkpoint: Path | None) -> MatchedRun | None:
         """The match of the model of `start_from`, or of a checkpoint where the data are not of its kind.
 
         Raises:
@@ -84,13 +66,13 @@ class MatchedRun:
         if checkpoint is None and isinstance(data.data_source, FolderSource):
             data.data_source.split("train")  # refuses data without, before they are measured
         stored = stored_scene(checkpoint) if checkpoint else None
-        if checkpoint is not None and (stored is None or _is_of_kind(stored, data.scene)):
+        if checkpoint and (not stored or (stored.aliases == data.scene.aliases and not stored.differences(data.scene))):
             return None
         model = load_model(str(start)) if checkpoint is None else load_checkpoint(checkpoint)
         if checkpoint is None:
             recipe = with_members(model.emulator.recipe, config["model"]["members"])
             model = dataclasses.replace(model, emulator=adapted(model.emulator, recipe))
-        given, chosen = MatchOptions.read(config["materials"], config["stride"], config["strict"]), None
+        chosen = None
         try:
             match = match_data(model, data, *given)
         except ConfigError:
@@ -139,10 +121,6 @@ def _choose_materials(model: Pretrained, data: TrajectoryDataModule, given: Matc
 
     trial = Trial.of(Dataset(data.data_source))
     return Ranking(trial, stride=given.stride).best(model.name, model.emulator).stated
-
-
-def _is_of_kind(model: Scene, data: Scene) -> bool:
-    return model.aliases == data.aliases and not model.differences(data)
 
 
 def stored_scene(checkpoint: Path) -> Scene | None:

@@ -2,97 +2,25 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import textwrap
-from collections.abc import Callable
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 from nmpm._support.atomic import file_obstacle, folder_obstacle, name_obstacle
-from nmpm._support.devices import check_device_name, find_device
+from nmpm._support.machine import check_device_name, find_device
 from nmpm._support.messages import one_line, suggestion
-from nmpm._support.shipped import preset_names
+from nmpm._support.shipped import find_preset, preset_names
+from nmpm.cli.command import Command, option
+from nmpm.data.stated import Options, Text
 from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from nmpm.data.convert import Options
+    from nmpm.emulator.similarity import Match
     from nmpm.zoo import Pretrained
-
-MODEL = (
-    "a model of the zoo (see nmpm zoo list); a path: a run, a checkpoint, or an entry's folder; or an id of the Hugging"
-    " Face hub, owner/repository@revision"
-)
-"""Help for arguments that `nmpm.zoo.load_model` takes."""
-
-
-_TYPES = {int: "INTEGER", float: "NUMBER", Path: "PATH"}
-"""What stands for a value of an option in the help."""
-
-
-class HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Help with types and defaults of options, and with prose filled to the terminal's width.
-
-    Paragraphs with indented lines, as examples are, stay as written.
-    """
-
-    def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
-        named = _TYPES.get(action.type) if isinstance(action.type, type) else None
-        return named or super()._get_default_metavar_for_optional(action)
-
-    def _get_help_string(self, action: argparse.Action) -> str | None:
-        text = action.help or ""
-        if not action.option_strings or "default" in text or action.default in (None, False, argparse.SUPPRESS, [], ""):
-            return text
-        return f"{text} (default: %(default)s)"
-
-    def _fill_text(self, text: str, width: int, indent: str) -> str:
-        paragraphs = text.strip("\n").split("\n\n")
-        filled = [
-            paragraph if "\n " in paragraph or paragraph.startswith(" ") else textwrap.fill(paragraph, width)
-            for paragraph in paragraphs
-        ]
-        return textwrap.indent("\n\n".join(filled), indent) + "\n"
-
-
-class CommandParser(argparse.ArgumentParser):
-    """A command's parser; an error is one line, and says where the options are."""
-
-    def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **{"formatter_class": HelpFormatter} | options)
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}. See {self.prog} --help.\n")
-
-
-def add_model_options(parser: argparse.ArgumentParser, default: str | None = None) -> None:
-    """Add the positional argument `model`, which may be left out where there is a default, and the option `--root`."""
-    if default is None:
-        parser.add_argument("model", help=MODEL)
-    else:
-        parser.add_argument("model", nargs="?", default=default, help=f"{MODEL} (default: {default})")
-    parser.add_argument("--root", type=Path, help="look the name up in this zoo's folder alone")
-
-
-def add_device_option(parser: argparse.ArgumentParser, purpose: str = "") -> None:
-    """Add the option `--device`; `purpose` begins its help."""
-    parser.add_argument(
-        "--device", default="cpu", help=f"{purpose}auto, cpu (default), cuda or mps; cuda:1 for the second GPU"
-    )
-
-
-def add_style_option(parser: argparse.ArgumentParser, drawn: str) -> None:
-    """Add the option `--style`, a key of `nmpm.viz.output.STYLES`; `drawn` begins its help."""
-    parser.add_argument("--style", choices=("talk", "paper"), help=f"{drawn} for slides (SVG) or for print (PDF)")
-
-
-def add_threads_option(parser: argparse.ArgumentParser) -> None:
-    """Add the option `--threads`."""
-    parser.add_argument(
-        "--threads",
-        type=int,
-        help="of a CPU (default: OMP_NUM_THREADS; else the faster of one and all that may be used, as measured)",
-    )
 
 
 def choose_threads(model: Pretrained, stated: int | None) -> None:
@@ -108,16 +36,6 @@ def choose_threads(model: Pretrained, stated: int | None) -> None:
         model.emulator.thread_choice = None if model.emulator.runtime.fixed_shapes else choice
 
 
-def add_runtime_option(parser: argparse.ArgumentParser) -> None:
-    """Add the option `--runtime`."""
-    parser.add_argument(
-        "--runtime",
-        default="eager",
-        help="what computes the network: eager (torch, default), openvino (CPU, the extra of that name), windows (for"
-        " large scenes that are mostly empty), or auto for the faster of eager and openvino here",
-    )
-
-
 RUNTIMES = ("auto", "openvino", "windows", "eager")
 """Values of `--runtime`; `nmpm.emulator.runtimes`, which imports torch, has them."""
 
@@ -129,22 +47,6 @@ def check_runtime(name: str) -> None:
             f"No runtime is called {one_line(repr(name), 60)}; there are {', '.join(RUNTIMES)}."
             f"{suggestion(name[:60], RUNTIMES)}"
         )
-
-
-def add_out_option(parser: argparse.ArgumentParser, default: Path) -> None:
-    """Add the option `--out` of a file for one trajectory."""
-    from nmpm.data.write import SUFFIXES
-
-    parser.add_argument(
-        "--out", type=Path, default=default, help=f"file to write, by its suffix: {SUFFIXES} (default: {default})"
-    )
-
-
-def add_split_option(parser: argparse.ArgumentParser, option: str) -> None:
-    """Add the option `--split` of data that another option or argument names."""
-    parser.add_argument(
-        "--split", choices=["train", "valid", "test"], help=f"of {option}, if it has several (default: test)"
-    )
 
 
 def check_model(model: str, root: Path | None = None) -> None:
@@ -159,12 +61,6 @@ def check_device(name: str) -> None:
     check_device_name(name)
     if name not in ("auto", "cpu"):  # which every machine has
         find_device(name)
-
-
-def check_at_least(option: str, value: int | None, least: int) -> None:
-    """Raise ConfigError if an integer option was given, but is too small."""
-    if value is not None and value < least:
-        raise ConfigError(f"{option} {value}: it must be at least {least}.")
 
 
 def check_output(option: str, path: Path) -> None:
@@ -231,112 +127,174 @@ def derived_name(path: Path, suffix: str) -> Path:
     return (Path(path.resolve().name) if path.is_dir() else path).with_suffix(suffix)
 
 
-def add_data_options(parser: argparse.ArgumentParser) -> None:
-    """Add options for facts that data files lack or state wrongly."""
-    group = parser.add_argument_group("facts that the files lack or state wrongly")
-    group.add_argument("--family", help="meaning of type ids: deepmind, lagrangebench or jax-sph")
-    group.add_argument("--types", metavar="ID=NAME,...", help="names of particle types, e.g. 5=water,1=debris")
-    group.add_argument("--static", metavar="ID,...", help='types that never move, e.g. 1,3; "none" where all move')
-    group.add_argument("--prescribed", metavar="ID,...", help="obstacles that move as recorded, like a paddle, e.g. 2")
-    group.add_argument("--bounds", metavar="LOW:HIGH,...", help="where particles may be, per axis, e.g. 0:1,0:0.5")
-    group.add_argument("--dt", type=float, help="time between stored frames, in the data's unit")
-    group.add_argument(
-        "--gravity", metavar="X,Y[,Z]", help="acceleration in length/time², e.g. 0,-9.81, or --gravity=-9.81,0"
-    )
-    group.add_argument(
-        "--boundary", metavar="KIND,...", help='"wall", "periodic" or "open" per axis, e.g. periodic,wall'
-    )
-    group.add_argument(
-        "--axes", metavar="TND", help="positions are frames, particles, axes, though their first two look swapped"
-    )
-    changes = parser.add_argument_group("changes of positions")
-    changes.add_argument("--resample", type=float, metavar="DT", help="interpolate to frames that are DT apart in time")
-    changes.add_argument(
-        "--smooth",
-        type=int,
-        metavar="FRAMES",
-        help="of measured tracks: replace positions by local quadratic fits to so many frames, e.g. 5; errors are then"
-        " against the smoothed tracks",
-    )
-    group.add_argument(
-        "--files", metavar="PATTERN,...", help="names of the files to read, e.g. 'Fluid_*.vtk', where others lie beside"
-    )
-    group.add_argument("--fields", metavar="NAME,...", help="fields that are inputs of models, e.g. temperature")
+# Types of options, with their checks, and groups of options that several commands share
 
 
-def data_options(options: argparse.Namespace) -> Options:
-    """The values of the options of `add_data_options`; raises ConfigError, naming the option that cannot be read."""
-    from nmpm.data.convert import Options
-    from nmpm.data.metadata import find_family
+@dataclass(frozen=True)
+class AtLeast:
+    """Check of an integer."""
 
-    if options.family is not None:
-        find_family(options.family)
-    return Options(
-        family=options.family,
-        types=parse_option("--types", options.types, _names, "ID=NAME pairs, e.g. 5=water,1=debris"),
-        static=parse_option("--static", options.static, _ids, 'type ids, e.g. 1,3, or "none"'),
-        prescribed=parse_option("--prescribed", options.prescribed, _ids, 'type ids, e.g. 2, or "none"'),
-        bounds=parse_option("--bounds", options.bounds, _intervals, "LOW:HIGH for each axis, e.g. 0:1,0:0.5"),
-        dt=options.dt,
-        gravity=gravity_option(options.gravity),
-        boundary=options.boundary and options.boundary.split(","),
-        fields=parse_option("--fields", options.fields, _field_names, "names, e.g. temperature,stiffness"),
-        resample=options.resample,
-        smooth=options.smooth,
-        axes=options.axes,
-        files=options.files,
-    )
+    least: int
+
+    def __call__(self, option: str, value: int) -> None:
+        """Raise ConfigError for a smaller value."""
+        if value < self.least:
+            raise ConfigError(f"{option} {value}: it must be at least {self.least}.")
 
 
-def stated_facts(options: argparse.Namespace) -> list[str]:
-    """The options of `add_data_options` that were given, with their values, as words of a command."""
-    from nmpm.data.convert import Options
+def _check_trajectory_file(option: str, path: Path) -> None:
+    from nmpm.data.write import find_writer
 
-    values = {field.name: getattr(options, field.name) for field in dataclasses.fields(Options)}
-    return [f"--{name}={value}" for name, value in values.items() if value is not None]
+    find_writer(option, path)
 
 
-def gravity_option(text: str | None) -> tuple[float, ...] | None:
-    """The numbers of `--gravity`; raises ConfigError if they cannot be read."""
-    numbers: tuple[float, ...] | None = parse_option(
-        "--gravity", text, _numbers, "a number for each axis, e.g. 0,-9.81"
-    )
-    return numbers
+Natural = Annotated[int, AtLeast(0)]
+Positive = Annotated[int, AtLeast(1)]
+Existing = Annotated[Path, check_exists]
+ExistingFile = Annotated[Path, check_input]
+OutputFile = Annotated[Path, check_output]
+OutputFolder = Annotated[Path, check_folder]
+Picture = Annotated[Path, check_picture]
+TrajectoryFile = Annotated[Path, _check_trajectory_file]
+Data = Annotated[Path, check_data]
+Device = Annotated[str, lambda _, name: check_device(name)]
+Runtime = Annotated[str, lambda _, name: check_runtime(name)]
+PresetName = Annotated[str, lambda _, name: find_preset(name)]
+SplitName = Literal["train", "valid", "test"]
+Style = Literal["talk", "paper"]
 
 
-def parse_option(option: str, text: str | None, parse: Callable[[str], Any], expected: str) -> Any:
-    """The value of an option's text, None of None; raises ConfigError, saying what is expected, if it is no such."""
-    if text is None:
-        return None
-    try:
-        return parse(text)
-    except ValueError as error:
-        raise ConfigError(f"{option} {text}: give {expected}.") from error
+@dataclass(frozen=True, kw_only=True)
+class ModelOptions(Command):
+    """The model.
+
+    Args:
+        model: A model of the zoo (see nmpm zoo list); a path: a run, a checkpoint, or an entry's folder; or an id of
+            the Hugging Face hub, owner/repository@revision.
+        root: Look the name up in this zoo's folder alone.
+    """
+
+    model: str
+    root: Path | None = None
+
+    def __post_init__(self) -> None:
+        check_model(self.model, self.root)  # a device's check may import torch
+        super().__post_init__()
 
 
-def _names(text: str) -> dict[int, str]:
-    pairs = [pair.split("=") for pair in text.split(",")]
-    return {int(index): name.strip() for index, name in pairs}
+@dataclass(frozen=True, kw_only=True)
+class DeviceOptions(Command):
+    """Where to compute.
+
+    Args:
+        device: auto, cpu, cuda or mps; cuda:1 for the second GPU.
+    """
+
+    device: Device = "cpu"
 
 
-def _ids(text: str) -> frozenset[int]:
-    return frozenset() if text == "none" else frozenset(map(int, text.split(",")))
+@dataclass(frozen=True, kw_only=True)
+class ThreadsOptions(Command):
+    """Threads of a CPU.
+
+    Args:
+        threads: Of a CPU (default: OMP_NUM_THREADS; else the faster of one and all that may be used, as measured).
+    """
+
+    threads: Positive | None = None
 
 
-def _numbers(text: str) -> tuple[float, ...]:
-    return tuple(map(float, text.split(",")))
+@dataclass(frozen=True, kw_only=True)
+class RuntimeOptions(Command):
+    """What computes the network.
+
+    Args:
+        runtime: What computes the network: eager (torch, default), openvino (CPU, the extra of that name), windows
+            (for large scenes that are mostly empty), or auto for the faster of eager and openvino here.
+    """
+
+    runtime: Runtime = "eager"
 
 
-def _intervals(text: str) -> tuple[tuple[float, float], ...]:
-    pairs = [tuple(map(float, pair.split(":"))) for pair in text.split(",")]
-    if any(len(pair) != 2 or not pair[0] < pair[1] for pair in pairs):
+@dataclass(frozen=True, kw_only=True)
+class FactOptions(Options, Command):
+    """Facts that data files lack or state wrongly."""
+
+    def __post_init__(self) -> None:
+        Command.__post_init__(self)
+        Options.__post_init__(self)
+
+    @property
+    def facts(self) -> Options:
+        """The facts alone."""
+        return Options(**{one.name: getattr(self, one.name) for one in dataclasses.fields(Options)})
+
+
+def _pairs(text: str) -> dict[str, str]:
+    pairs = [[name.strip() for name in pair.split("=")] for pair in text.split(",")]
+    if any(len(pair) != 2 or not all(pair) for pair in pairs):
         raise ValueError(text)
-    return tuple((pair[0], pair[1]) for pair in pairs)
+    renamed = dict(pairs)
+    if len(renamed) < len(pairs):
+        raise ValueError(text)
+    return renamed
 
 
-def _field_names(text: str) -> tuple[str, ...]:
-    from nmpm.scene import check_field_names
+def _stride(text: str) -> Fraction:
+    if not re.fullmatch(r"(1/)?0*[1-9][0-9]*", text):
+        raise ValueError(text)
+    return Fraction(text)
 
-    names = tuple(name.strip() for name in text.split(","))
-    check_field_names(names)
-    return names
+
+MATERIALS = Text(_pairs, "DATA=MODEL pairs of names, e.g. big=sand,small=sand")
+STRIDE = Text(_stride, "a whole number of the data's frames, e.g. 2, or a part, 1/4")
+
+
+class MatchOptions(NamedTuple):
+    """Arguments of `nmpm.emulator.similarity.find_match` that a user states; what is None is found there."""
+
+    materials: Mapping[str, str] | None = None
+    stride: Fraction | None = None
+    strict: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadingOptions(Command):
+    """How a model reads data of another kind than its own.
+
+    Args:
+        materials: Names of the data's materials, each with the model's material that it is, e.g. big=sand,small=sand.
+        stride: Frames of the data for one of the model, e.g. 2; or 1/4, where the model makes four of one (default:
+            what matches gravity best, or else speeds).
+    """
+
+    title: ClassVar[str] = "data of another kind than the model's"
+    materials: Annotated[str, MATERIALS] | None = option(metavar="DATA=MODEL,...")
+    stride: Annotated[str, STRIDE] | None = option(metavar="K")
+
+    @property
+    def match(self) -> MatchOptions:
+        """What is stated, as `nmpm.zoo.matching.match_data` takes it."""
+        return MatchOptions(
+            MATERIALS.read("--materials", self.materials),
+            STRIDE.read("--stride", self.stride),
+            getattr(self, "strict", False),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class StrictReadingOptions(ReadingOptions):
+    """How a model reads data of another kind than its own, or that it shall not.
+
+    Args:
+        strict: Refuse data that are not of the model's kind in gravity, frames, particles, speeds or walls.
+    """
+
+    title: ClassVar[str] = ReadingOptions.title
+    strict: bool = False
+
+
+def describe(match: Match, name: str) -> str:
+    """How the model of a name takes data, and what could not be matched, in lines."""
+    lines = [f"{name} takes these data as follows.", *(f"  {line}" for line in match.lines)]
+    return "".join(f"{line}\n" for line in (*lines, *(f"warning: {warning}" for warning in match.warnings)))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,8 +45,9 @@ class RunFolder:
             checkpoints[name] = folder / f"{section.get('filename') or name}.ckpt"
         return cls(root, checkpoints)
 
-    def lock(self) -> int:
-        """Keep other processes from training in this folder until the descriptor that is returned is closed.
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep other processes from training in this folder.
 
         The lock is the operating system's: it ends with the process, however it ends. Where the file system has none,
         nothing is locked.
@@ -54,21 +56,17 @@ class RunFolder:
             ConfigError: if another process trains here.
         """
         self.root.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(self.root / ".lock", os.O_RDWR | os.O_CREAT)
-        try:
-            locked = lock_descriptor(descriptor, blocking=False)
-        except OSError:
-            return descriptor
-        if not locked:
-            holder = os.read(descriptor, 20).decode() or "unknown"
-            os.close(descriptor)
-            raise ConfigError(
-                f"Another process ({holder}) is training in {self.root}. Wait for it, or choose another folder with"
-                " --trainer.default_root_dir."
-            )
-        os.truncate(descriptor, 0)
-        os.write(descriptor, str(os.getpid()).encode())
-        return descriptor
+        with open(os.open(self.root / ".lock", os.O_RDWR | os.O_CREAT), "r+", encoding="utf-8") as file:
+            with suppress(OSError):
+                if not lock_descriptor(file.fileno(), blocking=False):
+                    raise ConfigError(
+                        f"Another process ({file.read(20) or 'unknown'}) is training in {self.root}. Wait for it, or"
+                        " choose another folder with --trainer.default_root_dir."
+                    )
+                file.truncate(0)
+                file.write(str(os.getpid()))
+                file.flush()
+            yield
 
     def remove_unfinished(self) -> None:
         """Delete files that a process was writing when it was killed. Needs the folder's lock."""

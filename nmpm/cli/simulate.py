@@ -2,110 +2,114 @@
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nmpm._support.shipped import find_preset
-from nmpm.cli.options import CommandParser, check_at_least, check_folder, check_picture
+from nmpm.cli.command import Command, UsageError, option, positional
+from nmpm.cli.options import Natural, OutputFolder, Positive, check_folder, check_picture
 
 if TYPE_CHECKING:
     from nmpm.sim import Preset
 
 
-_EXAMPLES = """\
-examples:
-  nmpm simulate --list                               the shipped scenes
-  nmpm simulate waterramps --preview ramps.png       draw one trajectory, write no data
-  nmpm simulate waterramps --preview ramps.vtkhdf    write it for ParaView; .usda for Blender, …
-  nmpm simulate waterramps --train 100 --valid 10 --test 10 --out ramps
-  nmpm simulate waterramps --shard 2/8 --out ramps   one of 8 jobs; the last completes the folder
-  nmpm simulate my-scene.yaml --out mine             your own scene, from a copy of a shipped one
-  nmpm simulate goop --show > my-scene.yaml          such a copy, with comments
+@dataclass(frozen=True, kw_only=True)
+class Simulate(Command):
+    """Simulate a dataset of one of the shipped scenes, or of one's own.
 
-The same preset, seed and numbers give the same data. After an interruption the same call resumes. The metadata state
-that the data are simulated by nmpm.
-"""
+    Args:
+        name: A scene of --list, or a YAML file.
+        list: List the scenes, shipped and of installed packages.
+        show: Print the scene's YAML.
+        preview: Simulate one trajectory: a .png draws it, {suffixes} hold it.
+        train: Training trajectories (default: the paper's).
+        valid: Validation trajectories (default: the paper's).
+        test: Test trajectories (default: the paper's).
+        frames: Frames after the initial one (default: the scene's).
+        seed: Of the whole dataset (default: 0).
+        workers: Processes (default: one per processor core).
+        shard: Simulate the I-th of N parts, from 1 on; N processes share the folder --out.
+        out: Folder to write (default: the scene's name).
 
+    Examples:
+        nmpm simulate --list                               the scenes
+        nmpm simulate waterramps --preview ramps.png       draw one trajectory, write no data
+        nmpm simulate waterramps --preview ramps.vtkhdf    write it for ParaView; .usda for Blender, …
+        nmpm simulate waterramps --train 100 --valid 10 --test 10 --out ramps
+        nmpm simulate waterramps --shard 2/8 --out ramps   one of 8 jobs; the last completes the folder
+        nmpm simulate my-scene.yaml --out mine             your own scene, from a copy of a shipped one
+        nmpm simulate goop --show > my-scene.yaml          such a copy, with comments
 
-def run(words: list[str]) -> None:
-    """Run the command, e.g. ["simulate", "waterramps", "--out", "ramps"].
-
-    Raises:
-        SystemExit: with status 130 after Ctrl-C.
+        The same preset, seed and numbers give the same data. After an interruption the same call resumes. The metadata
+        state that the data are simulated by nmpm.
     """
-    from nmpm.data.write import SUFFIXES
 
-    parser = CommandParser(
-        prog="nmpm simulate",
-        description="Simulate a dataset of a shipped scene or your own, ready for training.",
-        epilog=_EXAMPLES,
-    )
-    parser.add_argument("name", nargs="?", help="a shipped scene, or a YAML file")
-    parser.add_argument("--list", action="store_true", help="list the shipped scenes")
-    parser.add_argument("--show", action="store_true", help="print the scene's YAML")
-    parser.add_argument(
-        "--preview", type=Path, metavar="FILE", help=f"simulate one trajectory: a .png draws it, {SUFFIXES} hold it"
-    )
-    for split in ("train", "valid", "test"):
-        parser.add_argument(f"--{split}", type=int, metavar="N", help=f"{split} trajectories (default: the paper's)")
-    parser.add_argument("--frames", type=int, help="frames after the initial one (default: the scene's)")
-    parser.add_argument("--seed", type=int, default=0, help="of the whole dataset (default: 0)")
-    parser.add_argument("--workers", type=int, help="processes (default: one per processor core)")
-    parser.add_argument(
-        "--shard", metavar="I/N", help="simulate the I-th of N parts, from 1 on; N processes share the folder --out"
-    )
-    parser.add_argument("--out", type=Path, help="folder to write (default: the scene's name)")
-    options = parser.parse_args(words[1:])
-    if options.list:
-        _list()
-        return
-    if options.name is None:
-        parser.error("name a scene, or use --list")
-    find_preset(options.name)
-    if options.show:
-        from nmpm.sim.loading import preset_text
+    name: str | None = positional()
+    list: bool = False
+    show: bool = False
+    preview: Path | None = option(metavar="FILE")
+    train: Natural | None = option(metavar="N")
+    valid: Natural | None = option(metavar="N")
+    test: Natural | None = option(metavar="N")
+    frames: Positive | None = None
+    seed: Natural = 0
+    workers: Positive | None = None
+    shard: str | None = option(metavar="I/N")
+    out: OutputFolder | None = None
 
-        sys.stdout.write(preset_text(options.name))
-        return
-    try:
-        _simulate(options)
-    except KeyboardInterrupt:
-        kept = "nothing was written" if options.preview else "the same command continues after finished trajectories"
-        raise KeyboardInterrupt(f"interrupted; {kept}.") from None
+    @classmethod
+    def help_values(cls) -> Mapping[str, str]:
+        from nmpm.data.write import suffixes
 
+        return {"suffixes": suffixes()}
 
-def _simulate(options: argparse.Namespace) -> None:
-    for name, least in (("workers", 1), ("frames", 1), ("seed", 0), ("train", 0), ("valid", 0), ("test", 0)):
-        check_at_least(f"--{name}", getattr(options, name), least)
-    if options.preview is not None:
-        _check_preview(options.preview)
-    elif options.out is not None:
-        check_folder("--out", options.out)
-    from nmpm.data import catalog
-    from nmpm.data.generate import generate, generate_shard
-    from nmpm.data.simulation import Shard
-    from nmpm.sim import load_preset
+    def run(self) -> None:
+        if self.list:
+            _list()
+            return
+        if self.name is None:
+            raise UsageError("name a scene, or use --list. See nmpm simulate --help.")
+        find_preset(self.name)
+        if self.show:
+            from nmpm.sim.loading import preset_text
 
-    shard = None if options.shard is None else Shard.parse(options.shard)
-    preset = load_preset(options.name)
-    preset = preset if options.frames is None else preset.with_frames(options.frames)
-    if options.preview is not None:
-        _preview(preset, options.seed, options.preview)
-        return
-    counts = dict(catalog.describe(options.name if options.name in catalog.catalog() else "goop").paper)
-    counts |= {name: getattr(options, name) for name in counts if getattr(options, name) is not None}
-    out = options.out or Path(preset.name)
-    check_folder("--out", out)
-    if shard is None:
-        generate(preset, out, counts, options.seed, options.workers)
-    elif missing := generate_shard(preset, out, counts, shard, options.seed, options.workers):
-        sys.stdout.write(f"shard {shard} is in {out}; trajectories of other shards that are not there yet: {missing}\n")
-        return
-    sys.stdout.write(f"wrote {', '.join(f'{n} {s}' for s, n in counts.items() if n)} trajectories to {out}\n")
-    sys.stdout.write(f"to look at them: nmpm inspect {shlex.quote(str(out))}\n")
+            sys.stdout.write(preset_text(self.name))
+            return
+        try:
+            self._simulate(self.name)
+        except KeyboardInterrupt:
+            kept = "nothing was written" if self.preview else "the same command continues after finished trajectories"
+            raise KeyboardInterrupt(f"interrupted; {kept}.") from None
+
+    def _simulate(self, name: str) -> None:
+        if self.preview is not None:
+            _check_preview(self.preview)
+        from nmpm.data import catalog
+        from nmpm.data.simulation import Shard, generate, generate_shard
+        from nmpm.sim import load_preset, preset_names
+
+        shard = None if self.shard is None else Shard.parse(self.shard)
+        preset = load_preset(name)
+        preset = preset if self.frames is None else preset.with_frames(self.frames)
+        if self.preview is not None:
+            _preview(preset, self.seed, self.preview)
+            return
+        counts = dict(catalog.describe(name if name in preset_names() else "goop").paper)
+        counts |= {split: getattr(self, split) for split in counts if getattr(self, split) is not None}
+        out = self.out or Path(preset.name)
+        check_folder("--out", out)
+        if shard is None:
+            generate(preset, out, counts, self.seed, self.workers)
+        elif missing := generate_shard(preset, out, counts, shard, self.seed, self.workers):
+            left = f"trajectories of other shards that are not there yet: {missing}"
+            sys.stdout.write(f"shard {shard} is in {out}; {left}\n")
+            return
+        sys.stdout.write(f"wrote {', '.join(f'{n} {s}' for s, n in counts.items() if n)} trajectories to {out}\n")
+        sys.stdout.write(f"to look at them: nmpm inspect {shlex.quote(str(out))}\n")
 
 
 def _check_preview(path: Path) -> None:
@@ -120,10 +124,10 @@ def _check_preview(path: Path) -> None:
 
 def _list() -> None:
     from nmpm.data import catalog
-    from nmpm.sim import load_preset
+    from nmpm.sim import load_preset, preset_names
 
     sys.stdout.write(f"{'scene':<17}{'method':<9}{'axes':<6}{'particles':<11}{'frames':<8}{'splits':<15}materials\n")
-    for name in catalog.catalog():
+    for name in preset_names():
         preset, paper = load_preset(name), catalog.describe(name).paper
         scene, splits = preset.scene, "/".join(map(str, paper.values()))
         facts = {"obstacles": scene.obstacles, "gravity varies": scene.gravity_varies}
@@ -138,7 +142,7 @@ def _list() -> None:
 def _preview(preset: Preset, seed: int, path: Path) -> None:
     from nmpm._support.progress import progress_bar
     from nmpm.data.format import Trajectory
-    from nmpm.data.generate import preset_metadata
+    from nmpm.data.simulation import preset_metadata
     from nmpm.data.write import is_written_by_suffix, write_trajectory
     from nmpm.viz import write_snapshots
     from nmpm.viz.files import label_trajectory

@@ -1,78 +1,331 @@
-"""`nmpm fit | validate | test | predict`: help, runs' folders, and checks before torch and Lightning are imported.
-
-The help is read from the source. `--help_all` lists every option with type and default, also those of Lightning's
-Trainer, and takes the seconds that importing Lightning takes.
-"""
+"""`nmpm fit | validate | test | predict`: their options, and checks before torch and Lightning are imported."""
 
 from __future__ import annotations
 
-import ast
+import argparse
+import json
 import os
 import re
-import shutil
-import sys
-import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from difflib import get_close_matches
+from functools import cache, partial
+from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import yaml
 
+from nmpm._support.bounded_files import read_yaml
 from nmpm._support.messages import counted
-from nmpm._support.shipped import PACKAGE
-from nmpm.cli import COMMANDS
-from nmpm.cli.early_checks import (
-    NOT_FILES,
-    SIGNATURES,
-    Option,
-    UsageError,
-    arguments,
-    check_options,
-    class_definition,
-    read_config,
-    read_options,
-)
-from nmpm.cli.match_options import MatchOptions
+from nmpm._support.shipped import PACKAGE, check_dataset, find_config
+from nmpm.cli import expand_home
+from nmpm.cli.command import CommandParser, HelpFormatter, UsageError, command_parser, nearest, option, positional
+from nmpm.cli.options import Positive, StrictReadingOptions, ThreadsOptions, check_folder, check_model
 from nmpm.cli.run_folder import CONFIG, RunFolder
 from nmpm.cli.trust import NAME, OPTION, foreign_names, trust_advice
-from nmpm.errors import ConfigError
+from nmpm.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from nmpm.data.convert import Options
 
+OPTIONS_FILE = PACKAGE / "cli" / "training_options.json"
 FINE_TUNING = PACKAGE / "cli" / "fine_tune.yaml"
 """The configuration of fine-tunings that name none."""
 ROOT, CHECKPOINT = "--trainer.default_root_dir", "--ckpt_path"
-
-
+NOT_FILES = (None, "last", "best", "null", "???")
+"""Values of paths that name no file."""
 FEWEST_STEPS = 2_000
 """Steps of single particles, from frame to frame, from which on a training is started without being asked for."""
-_REPLACED = {"--help_all": "--help", "--strict": "--strict=true"}
 
 
-def run(words: list[str]) -> int:
-    """Run a training command, e.g. ["fit", "--config", "goop.yaml"], and return the exit status."""
-    command = words[0]
-    if "--help" in words or "-h" in words:
-        sys.stdout.write(training_help(command, COMMANDS[command][1]))
-        return 0
-    forget_unused_slurm()
-    try:
-        options = read_options([_REPLACED.get(word, word) for word in words[1:]])
-        trusts = Option(OPTION) in options
-        own = [option for option in options if option.name != OPTION]
+@cache
+def known_options() -> Mapping[str, Any]:
+    """What `nmpm.cli.run_training.training_options` found in the classes: types, defaults and texts of their arguments.
+
+    It is stored, as the classes take seconds to import; `python -m nmpm.cli.run_training` writes the file anew.
+    """
+    known: dict[str, Any] = json.loads(OPTIONS_FILE.read_text(encoding="utf-8"))
+    if metadata.version("lightning") != known.pop("lightning"):
+        known["trainer"] = {}  # another version's arguments: its own parser knows them
+    return known
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training(StrictReadingOptions, ThreadsOptions):
+    """A training or evaluation by LightningCLI; options of its own, and of LightningCLI by the stored table.
+
+    Args:
+        config: YAML; a name that is no file here is looked up among the shipped ones (nmpm --help lists them).
+        ckpt_path: A checkpoint of the run, or a file: fit goes on from it, the other commands run it.
+        seed_everything: Seed of all random numbers (default: 0).
+        print_config: Print the configuration that results, and stop.
+        trust_config: Run what the configuration of RUN names although nmpm did not write it.
+        threads: Of a CPU, which compute parts of a batch (default: OMP_NUM_THREADS; else the faster of one and all that
+            may be used, as measured). Another number changes results by rounding.
+    """
+
+    config: str | None = option(metavar="FILE")
+    ckpt_path: str | None = option(metavar="last|best|FILE", label=CHECKPOINT)
+    seed_everything: str | None = option(metavar="N", label="--seed_everything")
+    print_config: bool = option(False, label="--print_config")
+    trust_config: bool = False
+
+    @classmethod
+    def add_arguments(cls, parser: CommandParser) -> None:
+        """Add the arguments behind --model., --data. and --trainer.; those without a text are hidden in the help."""
+        run = "--resume RUN" if issubclass(cls, Fit) else "RUN"
+        parser.usage = "".join(
+            f"{start} {words} [--SECTION.KEY VALUE ...]"
+            for start, words in ((parser.prog, "--config FILE"), (f"\n       {parser.prog}", run))
+        )
+        parser.formatter_class = partial(HelpFormatter, max_help_position=30)  # type: ignore[assignment]  # (made alike)
+        parser.allow_abbrev = False
+        parser.parts = known_options()["parts"]
+        for name in ("--weights_only", "--verbose", "--help_all"):
+            parser.add_argument(name, nargs="?", help=argparse.SUPPRESS)
+        for section, title in _SECTIONS.items():
+            group = parser.add_argument_group(title)
+            for key, argument in known_options()[section].items():
+                default = "" if argument["default"] is None else f"; default: {argument['default']}"
+                text = argument["text"] and f"{argument['text']} ({argument['type']}{default})".replace("%", "%%")
+                name = f"--{section}.{key}"
+                group.add_argument(name, type=_type(argument), metavar="", help=text or argparse.SUPPRESS)
+
+    @classmethod
+    def run_words(cls, prog: str, words: Sequence[str]) -> int:
+        """Check what can be checked at once, and run the command by LightningCLI."""
+        parser = command_parser(cls, prog)
+        if not {"-h", "--help"}.isdisjoint(words):
+            parser.parse_args(["--help"])
+        command = prog.split()[-1]
+        forget_unused_slurm()
+        own = read_options(words, [name for name, action in parser._option_string_actions.items() if action.nargs == 0])
         options, note = expand_run(command, own)
+        values = parser.parse_args([word for one in own for word in _checked_words(one)])
+        cls(**{one.name: values[one.name] for one in fields(cls)})
+        trusts = values["trust_config"]
         if not trusts:
             check_trust(own, options)
+        options = [one for one in options if one.name != OPTION]
         check_options(options)
-        check_match_options(command, options)
         options = add_configuration(options) if command == "fit" else options
         from nmpm.cli.run_training import run_command
 
-        return run_command([command, *map(str, options)], note, None if trusts or own == options else names_in(own))
-    except UsageError as error:
-        sys.stderr.write(f"nmpm {command}: {error}\n")
-        return 2
+        trusted = None if trusts or not note else names_in(own)
+        return run_command([command, *(_REPLACED.get(word, word) for word in map(str, options))], note, trusted)
+
+
+_SECTIONS = {"model": "the model", "data": "the data", "trainer": "Lightning's Trainer, such as"}
+_UNCHECKED = ("checkpoint", "resume", "optimizer", "lr_scheduler")
+"""Sections of options that are not stored."""
+_REPLACED = {"--help_all": "--help", "--strict": "--strict=true"}
+"""Words of LightningCLI's parser for flags."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit(Training):
+    """Train an emulator, then test the best checkpoint once.
+
+    RUN is the folder of a run, which holds its configuration; it may have been moved or copied. Options replace what
+    the configuration says, and later --config files what earlier ones say. What none of them says has the default that
+    --help_all shows. --checkpoint.KEY and --resume.KEY are of Lightning's ModelCheckpoint: which checkpoint is the
+    best, and how often the one to resume from is written.
+
+    Args:
+        resume: Go on with the run in this folder after an interruption.
+        start_from: Start with a zoo model, a run or a checkpoint, with its cells, network, transfer, decoder and
+            constraints; without --config, train as fine-tunings do, for five minutes.
+
+    Examples:
+        nmpm fit --config goop.yaml                           simulate data, train, test, draw
+        nmpm fit --resume runs/goop                           go on after an interruption
+        nmpm fit --config goop.yaml --trainer.max_time 00:00:05 --trainer.default_root_dir runs/short
+        nmpm fit --data.path FOLDER                           on your own data, configured as by init
+        nmpm fit --start_from sandramps --data.path FOLDER --materials big=sand,small=sand
+                                                              ... from a pretrained model, in five minutes
+        nmpm fit --config waterdrop.yaml --data.path FOLDER   on recorded data, by another
+
+        nmpm fit --help_all                                   every option; takes seconds
+        nmpm fit --config goop.yaml --print_config            the whole configuration
+        nmpm fit --model.processor.help nmpm.processors.UNet  options of a part
+    """
+
+    resume: str | None = option(metavar="RUN")
+    start_from: str | None = option(metavar="MODEL", label="--start_from")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("materials", "stride", "strict"):
+            if getattr(self, name) and not self.start_from:
+                raise ConfigError(f"--{name} is of --start_from MODEL: data are matched to a model that there is.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation(Training):
+    """An evaluation of a checkpoint.
+
+    Args:
+        folder: The folder of a run, which holds its configuration and checkpoints; it may have been moved or copied.
+            Options replace what the configuration says.
+    """
+
+    folder: str | None = positional(metavar="RUN")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Validate(Evaluation):
+    """Roll a checkpoint out over the valid split.
+
+    Examples:
+        nmpm validate runs/goop                               its best weights
+    """
+
+
+@dataclass(frozen=True, kw_only=True)
+class Test(Evaluation):
+    """Roll a checkpoint out over the test split; write table, picture and animation.
+
+    Args:
+        members: Score so many rollouts of each scene as an ensemble, too: fair CRPS, spread over skill.
+
+    Examples:
+        nmpm test runs/goop                                   its best weights
+        nmpm test runs/goop --ckpt_path last                  its last ones
+        nmpm test runs/goop --data.path FOLDER                on other scenes
+    """
+
+    members: Positive | None = option(metavar="M")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Predict(Evaluation):
+    """Roll a checkpoint out over the test split and write the trajectories.
+
+    Examples:
+        nmpm predict runs/goop                                its best weights
+    """
+
+
+class Option(NamedTuple):
+    """A word of the command line that is an option, with its value if it has one, or a word on its own."""
+
+    name: str
+    value: str | None = None
+
+    def __str__(self) -> str:
+        return self.name if self.value is None else f"{self.name}={self.value}"
+
+
+def read_options(words: Sequence[str], flags: Sequence[str] = ()) -> list[Option]:
+    """The options among words: with a value that follows or stands behind `=`, or without; and words on their own.
+
+    The value of --config becomes the path of the file that it means; ConfigError if there is none.
+    """
+    options: list[Option] = []
+    rest = list(words)
+    while rest:
+        word = rest.pop(0)
+        name, mark, value = word.partition("=")
+        if not word.startswith("-"):
+            read = Option(word)
+        elif mark:
+            read = Option(name, value)
+        elif name not in flags and rest and not re.match(r"--?[a-zA-Z]", rest[0]):
+            read = Option(name, rest.pop(0))
+        else:
+            read = Option(name)
+        if read.name in ("--config", "-c") and read.value:
+            read = Option("--config", str(find_config(read.value)))
+        options.append(read)
+    return options
+
+
+def _checked_words(one: Option) -> Iterator[str]:
+    """The words of an option for the stored parser, which has no arguments of parts and reads no references."""
+    section, _, rest = one.name.removeprefix("--").rstrip("+").partition(".")
+    if section in _UNCHECKED or (section in _SECTIONS and (rest in ("", "help") or not known_options()[section])):
+        return
+    if one.name != "--print_config" and one.value != "null" and "${" not in (one.value or ""):
+        name = ".".join(one.name.rstrip("+").split(".")[:2])
+        yield str(Option(name, one.value))
+
+
+def _type(argument: Mapping[str, Any]) -> Any:
+    """The type of a stored argument that the stored parser checks; None for those that are classes or sequences."""
+    scalars = {"int": int, "float": float, "bool": bool, "SourceName": Literal["disk", "simulate", "hub"]}
+    return scalars.get(re.sub(r" \| None$|^Optional\[(\w+)\]$", r"\1", argument["type"]))
+
+
+def read_config(path: Path) -> Mapping[str, Any]:
+    """Read a configuration file; an empty mapping where it holds something else, UsageError if it is not YAML."""
+    try:
+        return read_yaml(path)
+    except DataError as error:
+        raise UsageError(f"--config {error}") from error
+
+
+def _configs(options: Sequence[Option]) -> list[Mapping[str, Any]]:
+    """The configuration files that options name."""
+    return [read_config(Path(value)) for name, value in options if name == "--config" and value]
+
+
+def _section(config: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    return section if isinstance(section := config.get(name), Mapping) else {}
+
+
+def stated_keys(options: Sequence[Option], section: str) -> set[str]:
+    """Arguments behind --model.… or --data.… that options, or configurations that they name, state."""
+    given = {name.split(".")[1] for name, _ in options if name.startswith(f"--{section}.")}
+    return given.union(*(map(str, _section(config, section)) for config in _configs(options)))
+
+
+def check_options(options: Sequence[Option]) -> None:
+    """Check keys of configurations, names of classes, and that files, data and models exist.
+
+    Raises:
+        UsageError: for a misspelt name, or a configuration that is not YAML.
+        ConfigError, DataError, ZooError: if dataset, checkpoint or the model to start from do not exist.
+    """
+    configs = _configs(options)
+    for section, names in ((name, known_options()[name]) for name in _SECTIONS):
+        for key in (key for config in configs for key in _section(config, section)):
+            if names and key not in (*names, "class_path", "init_args"):
+                wrong, all_names = f"{section}.{key}", [f"{section}.{name}" for name in names]
+                hint = nearest(wrong, all_names, known_options()["parts"], "")
+                raise UsageError(f"the configuration has an unknown key {wrong}{hint}")
+    for one in options:
+        module, _, kind = (one.value or "").rpartition(".")
+        classes = known_options()["classes"].get(module, ())
+        if kind not in classes and (near := get_close_matches(kind, classes, n=1)):
+            raise UsageError(f"{one.name}: there is no {one.value}; did you mean {module}.{near[0]}?")
+    keys = ("trainer.default_root_dir", "data.path", "ckpt_path", "start_from", "data.source", "data.name")
+    values = {key: _value(options, configs, key) for key in keys}
+    stated = {key: str(value) for key, value in values.items() if value not in NOT_FILES and "${" not in str(value)}
+    if values["trainer.default_root_dir"]:
+        check_folder(ROOT, Path(str(values["trainer.default_root_dir"])))
+    for key, noun in (("data.path", "dataset"), ("ckpt_path", "checkpoint")):
+        if key in stated and not Path(stated[key]).exists():
+            raise ConfigError(f"--{key} {stated[key]}: there is no such {noun}.")
+    if "start_from" in stated:
+        check_model(stated["start_from"])
+    if values["data.path"] in NOT_FILES and values["data.source"] in (None, "disk", "simulate"):
+        asks = re.compile(r"--(data|config|print_config|help_all)|--.*\.help")
+        if values["data.path"] is values["data.name"] is None and not any(asks.fullmatch(one.name) for one in options):
+            raise ConfigError(
+                "there are no data: give --data.path FOLDER, --config FILE, or --data.name and an embedded dataset"
+                " (nmpm simulate --list)."
+            )
+        if "data.name" in stated:
+            check_dataset(stated["data.name"])
+
+
+def _value(options: Sequence[Option], configs: Sequence[Mapping[str, Any]], key: str) -> Any:
+    """The value of the last option, or else of the last configuration, that has the key; None if none does."""
+    given = [option.value for option in options if option.name == f"--{key}"]
+    stated = [value for config in configs if (value := _stated_value(config, key, missing=...)) is not ...]
+    value = (given or stated or [None])[-1]
+    return expand_home(value) if isinstance(value, str) else value
 
 
 def names_in(options: Sequence[Option]) -> frozenset[str]:
@@ -98,16 +351,6 @@ def forget_unused_slurm() -> None:
         os.environ.pop("SLURM_NTASKS", None)
 
 
-def check_match_options(command: str, options: Sequence[Option]) -> None:
-    """Raise ConfigError if --materials or --stride cannot be read, or a training that starts from no model has them."""
-    given = {option.name: option.value for option in options}
-    MatchOptions.read(given.get("--materials"), given.get("--stride"))
-    if command == "fit" and "--start_from" not in given:
-        for name in ("--materials", "--stride", "--strict"):
-            if name in given:
-                raise ConfigError(f"{name} is of --start_from MODEL: data are matched to a model that there is.")
-
-
 def add_configuration(options: Sequence[Option]) -> list[Option]:
     """The options with a configuration for --data.path, where they name none.
 
@@ -120,30 +363,28 @@ def add_configuration(options: Sequence[Option]) -> list[Option]:
     path = given.get("--data.path")
     if path is None or path in NOT_FILES or "--config" in given or "--print_config" in given:
         return list(options)
+    from nmpm.cli.init import MINUTES, dataset_name, write_for_fit
     from nmpm.data.convert import Options
     from nmpm.data.new_configuration import OPTIONS
 
-    stated = {name: yaml.safe_load(given.get(f"--data.{name}") or "null") for name in OPTIONS}
-    stated["prescribed"] = stated["prescribed"] and frozenset(stated["prescribed"])
-    facts = Options(**stated)
+    facts = Options(**{name: yaml.safe_load(given.get(f"--data.{name}") or "null") for name in OPTIONS})
     if not {"--trainer.max_steps", "--trainer.max_time"} & given.keys():
         check_enough_data(Path(path), facts)
+    root = given.get(ROOT) or f"runs/{dataset_name(Path(path))}"
     if "--start_from" in given:
-        return _add_fine_tuning(options, Path(path))
+        return [Option("--config", str(FINE_TUNING)), Option(ROOT, root), *options]
     if any(int(os.environ.get(name) or 1) > 1 for name in ("WORLD_SIZE", "SLURM_NTASKS")):
         raise ConfigError(f"Several processes need one --config: write it first, by nmpm init {path}.")
-    from nmpm.cli.init import MINUTES, dataset_name, write_for_fit
-
-    root = Path(given.get(ROOT) or f"runs/{dataset_name(Path(path))}")
-    minutes = _minutes(given.get("--trainer.max_time") or "") or MINUTES
-    return [Option("--config", str(write_for_fit(Path(path), facts, root, minutes))), *options]
+    time = re.fullmatch(r"(\d+):(\d+):(\d+):(\d+)", given.get("--trainer.max_time") or "")
+    days, hours, minutes, seconds = map(int, time.groups()) if time else (0, 0, 0, 0)
+    budget = 1440 * days + 60 * hours + minutes + seconds / 60
+    return [Option("--config", str(write_for_fit(Path(path), facts, Path(root), budget or MINUTES))), *options]
 
 
 def check_enough_data(path: Path, facts: Options) -> None:
     """Raise ConfigError if there is so little to train on that the minutes of a training would be wasted."""
-    from nmpm.data.format import Split
-    from nmpm.data.loading.sources import FolderSource
-    from nmpm.data.split_files import split_paths
+    from nmpm.data.format import Split, split_paths
+    from nmpm.data.sources import FolderSource
 
     source = FolderSource(path, facts)
     splits = split_paths(source.folder)
@@ -159,24 +400,6 @@ def check_enough_data(path: Path, facts: Options) -> None:
         )
 
 
-def _add_fine_tuning(options: Sequence[Option], path: Path) -> list[Option]:
-    """The options with the configuration of fine-tunings, and a run's folder of the dataset's name."""
-    from nmpm.cli.init import dataset_name
-
-    given = {option.name: option.value for option in options}
-    root = given.get(ROOT) or f"runs/{dataset_name(path)}"
-    return [Option("--config", str(FINE_TUNING)), Option(ROOT, root), *options]
-
-
-def _minutes(time: str) -> float | None:
-    """The minutes of DD:HH:MM:SS; None for another form."""
-    parts = re.fullmatch(r"(\d+):(\d+):(\d+):(\d+)", time)
-    if parts is None:
-        return None
-    days, hours, minutes, seconds = map(int, parts.groups())
-    return 1440 * days + 60 * hours + minutes + seconds / 60
-
-
 def expand_run(command: str, options: Sequence[Option]) -> tuple[list[Option], str]:
     """Replace "runs/goop", or "--resume runs/goop" of fit, by the run's configuration, folder and checkpoint.
 
@@ -187,20 +410,25 @@ def expand_run(command: str, options: Sequence[Option]) -> tuple[list[Option], s
         UsageError: if `--resume` lacks the folder, or `nmpm fit` gets one without `--resume`.
         ConfigError: if the folder, its configuration or its checkpoint does not exist.
     """
-    first = options[0].name if options and not options[0].name.startswith("-") else None
-    if command != "fit":
-        run, others = first, list(options[1:] if first else options)
-    elif first:
-        raise UsageError(f"to go on with a run, call nmpm fit --resume {first}.")
-    else:
-        resumed = [option for option in options if option.name == "--resume"]
-        if any(not option.value for option in resumed):
+    runs = [one.name for one in options if not one.name.startswith("-")]
+    if command == "fit":
+        if runs:
+            raise UsageError(f"to go on with a run, call nmpm fit --resume {runs[0]}.")
+        resumed = [one.value for one in options if one.name == "--resume"]
+        if not all(resumed):
             raise UsageError("--resume lacks the folder of a run, such as --resume runs/goop.")
-        run, others = resumed[-1].value if resumed else None, [one for one in options if one.name != "--resume"]
-    if run is None:
+        runs = [run for run in resumed if run]
+    others = [one for one in options if one.name.startswith("-") and (command, one.name) != ("fit", "--resume")]
+    if not runs:
         return others, ""
-    root = Path(run)
-    config = _run_config(root)
+    run, root = runs[-1], Path(runs[-1])
+    if root.is_file():
+        raise ConfigError(f"{run} is a file: name the folder of a run, or give --config FILE {CHECKPOINT} {run}.")
+    if not root.is_dir():
+        raise ConfigError(f"{run}: there is no such folder.")
+    if not (root / CONFIG).is_file():
+        raise ConfigError(f"{run} is not the folder of a run: there is no {CONFIG} in it.")
+    config = read_config(root / CONFIG)
     names = {option.name for option in others}
     implied = [] if ROOT in names else [Option(ROOT, run)]
     if names & {"--data.path", "--data.name"} and _stated_value(config, "data.reading"):
@@ -211,16 +439,6 @@ def expand_run(command: str, options: Sequence[Option]) -> tuple[list[Option], s
     changes = "; ".join(_changes(others, config))
     note = f"Run: {run}{f', changed: {changes}' if changes else ''}.\n"
     return [Option("--config", str(root / CONFIG)), *others, *implied], note
-
-
-def _run_config(run: Path) -> Mapping[str, Any]:
-    if run.is_file():
-        raise ConfigError(f"{run} is a file: name the folder of a run, or give --config FILE {CHECKPOINT} {run}.")
-    if not run.is_dir():
-        raise ConfigError(f"{run}: there is no such folder.")
-    if not (run / CONFIG).is_file():
-        raise ConfigError(f"{run} is not the folder of a run: there is no {CONFIG} in it.")
-    return read_config(run / CONFIG)
 
 
 def _changes(options: Sequence[Option], config: Mapping[str, Any]) -> Iterator[str]:
@@ -237,124 +455,13 @@ def _changes(options: Sequence[Option], config: Mapping[str, Any]) -> Iterator[s
                 yield f"{key} = {value} (was {'null' if old is None else old})"
 
 
-def _stated_value(config: Mapping[str, Any], key: str) -> Any:
-    """The value of a dotted key, in which "init_args" may be left out; None if it is not stated."""
+def _stated_value(config: Mapping[str, Any], key: str, missing: Any = None) -> Any:
+    """The value of a dotted key, in which "init_args" may be left out."""
     value: Any = config
     for part in key.split("."):
         if isinstance(value, Mapping) and part not in value:
             value = value.get("init_args")
-        value = value.get(part) if isinstance(value, Mapping) else None
+        if not isinstance(value, Mapping) or part not in value:
+            return missing
+        value = value[part]
     return value
-
-
-LINKED = {"model": {"scene", "recipe"}, "data": {"horizon"}}
-"""Arguments that the command line takes from elsewhere."""
-INDENT = 30
-
-HELP = """\
-usage: nmpm {command} --config FILE [--SECTION.KEY VALUE ...]
-       nmpm {command} {run} [--SECTION.KEY VALUE ...]
-
-{summary}
-RUN is the folder of a run, which holds its configuration; it may have been moved or copied.
-Options replace what the configuration says, and later --config files what earlier ones say. What
-none of them says has the default that --help_all shows.
-
-examples:
-{examples}
-
-options:
-{options}
-
---model.KEY:
-{model}
-
---data.KEY:
-{data}
-
---trainer.KEY, of Lightning's Trainer, such as:
-{trainer}
-
---checkpoint.KEY and --resume.KEY are of Lightning's ModelCheckpoint: which checkpoint is the best,
-and how often the one to resume from is written.
-
-more:
-  nmpm {command} --help_all                  every option with type and default; takes seconds
-  nmpm {command} --config goop.yaml --print_config
-      the whole configuration
-  nmpm {command} --model.processor.help nmpm.processors.UNet
-      options of a part
-"""
-EXAMPLES = {
-    "fit": """\
-  nmpm fit --config goop.yaml                           simulate data, train, test, draw
-  nmpm fit --resume runs/goop                           go on after an interruption
-  nmpm fit --config goop.yaml --trainer.max_time 00:00:05 --trainer.default_root_dir runs/short
-  nmpm fit --data.path FOLDER                           on your own data, configured as by init
-  nmpm fit --start_from sandramps --data.path FOLDER --materials big=sand,small=sand
-                                                        ... from a pretrained model, in five minutes
-  nmpm fit --config waterdrop.yaml --data.path FOLDER   on recorded data, by another""",
-    "validate": """\
-  nmpm validate runs/goop                               its best weights""",
-    "test": """\
-  nmpm test runs/goop                                   its best weights
-  nmpm test runs/goop --ckpt_path last                  its last ones
-  nmpm test runs/goop --data.path FOLDER                on other scenes""",
-    "predict": """\
-  nmpm predict runs/goop                                its best weights""",
-}
-OPTIONS = {
-    "--config FILE": "YAML; a name that is no file here is looked up among the shipped ones (nmpm --help lists them)",
-    "--ckpt_path last|best|FILE": "a checkpoint of the run, or a file: fit goes on from it, the other commands run it",
-    "--start_from MODEL": "fit only: start with a zoo model, a run or a checkpoint, with its cells, network and"
-    " constraints; without --config, train as fine-tunings do, for five minutes",
-    "--materials DATA=MODEL,...": "of a model on data of another kind: which of its materials each of the data's is",
-    "--stride K": "likewise: frames of the data for one of the model, such as 2 or 1/4 (default: what matches best)",
-    "--strict": "likewise: refuse data whose gravity, frames, particles, speeds or walls are not the model's",
-    "--members N": "test only: score so many rollouts of each scene as an ensemble, too",
-    "--trust-config": "run what the configuration of RUN names although nmpm did not write it",
-    "--seed_everything N": "seed of all random numbers (default: 0)",
-    "--print_config": "print the configuration that results, and stop",
-}
-TRAINER = {
-    "default_root_dir": "folder of the run's files; further runs go to its version_1, version_2, ...",
-    "max_steps, max_time": "end of the training: steps, or DD:HH:MM:SS, whichever is first",
-    "accelerator, devices": "where to compute: auto, cpu, gpu; how many devices, see docs/scaling.md",
-    "precision": "of the network: bf16-mixed, or 32-true, which CPUs without bfloat16 take in its place",
-    "val_check_interval": "steps from validation to validation",
-    "enable_progress_bar": "false for none",
-}
-
-
-def training_help(command: str, summary: str) -> str:
-    """The help of a training command, with a sentence that says what it does."""
-    sections = {group: "\n".join(_entries(dict(_described(group)))) for group in SIGNATURES}
-    shared = {"options": "\n".join(_entries(OPTIONS)), "trainer": "\n".join(_entries(TRAINER))}
-    run = "--resume RUN" if command == "fit" else "RUN"
-    return HELP.format(command=command, run=run, summary=summary, examples=EXAMPLES[command], **shared, **sections)
-
-
-def _described(group: str) -> Iterator[tuple[str, str]]:
-    """Arguments of --model.… or --data.…, in their order: the first sentence about each, type and default."""
-    known = arguments(group)
-    for file, name in SIGNATURES[group]:
-        for key, text in _argument_texts(ast.get_docstring(class_definition(file, name)) or ""):
-            if key in known and key not in LINKED[group]:
-                default = "" if known[key].default in (None, "None") else f"; default: {known[key].default}"
-                yield key, f"{re.split(r'[.] (?=[A-Z])|[.]$', text)[0]} ({known[key].type}{default})"
-
-
-def _argument_texts(docstring: str) -> Iterator[tuple[str, str]]:
-    """Names and texts of the section "Args:" of a docstring."""
-    section = re.search(r"^Args:\n(.*?)(?=^\S|\Z)", docstring, flags=re.DOTALL | re.MULTILINE)
-    for entry in re.split(r"\n(?=    \w)", section[1].rstrip() if section else ""):
-        key, _, text = entry.strip().partition(": ")
-        yield key, " ".join(text.split())
-
-
-def _entries(described: dict[str, str]) -> Iterator[str]:
-    for key, text in described.items():
-        first, *others = textwrap.wrap(text, max(60, shutil.get_terminal_size().columns) - INDENT)
-        start = f"  {key}".ljust(INDENT)
-        yield start + first if len(start) == INDENT else f"{start}\n{' ' * INDENT}{first}"
-        yield from (" " * INDENT + other for other in others)

@@ -4,13 +4,10 @@ those of torch and Lightning that its own runs use. Nothing is imported here.
 
 from __future__ import annotations
 
-import ast
 import re
 from collections.abc import Collection, Iterator, Mapping
-from functools import cache
 from importlib.metadata import entry_points
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 from nmpm._support.messages import one_line
@@ -65,26 +62,14 @@ def _is_known(name: str) -> bool:
 
 
 def _is_shipped(name: str) -> bool:
-    """Whether a module of nmpm defines a class of this name, or imports it from another one."""
+    """Whether a module of nmpm, or one of a package's modules, defines a class of this name."""
     module, _, kind = name.rpartition(".")
-    package, *inner = module.split(".")
-    if package != "nmpm" or not NAME.fullmatch(name):
+    if not NAME.fullmatch(name) or module.partition(".")[0] != "nmpm":
         return False
-    place = PACKAGE.joinpath(*inner)
-    return kind in _classes(place / "__init__.py" if place.is_dir() else place.with_suffix(".py"))
-
-
-@cache
-def _classes(file: Path) -> frozenset[str]:
-    names = set[str]()
-    for node in ast.parse(file.read_text(encoding="utf-8")).body if file.is_file() else ():
-        if isinstance(node, ast.ClassDef):
-            names.add(node.name)
-        elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("nmpm."):
-            names |= {
-                alias.name for alias in node.names if alias.name[:1].isupper() and alias.asname in (None, alias.name)
-            }
-    return frozenset(names)
+    path = PACKAGE.parent.joinpath(*module.split("."))
+    files = [*path.rglob("*.py"), path.with_suffix(".py")]
+    definition = re.compile(rf"^class {kind}\b", re.MULTILINE)
+    return any(definition.search(file.read_text(encoding="utf-8")) for file in files if file.is_file())
 
 
 def _is_of_plugin(name: str) -> bool:

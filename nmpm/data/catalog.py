@@ -9,15 +9,12 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
-from nmpm._support.shipped import check_dataset, preset_names, user_home
+from nmpm._support.shipped import check_dataset, user_home
 from nmpm.data.format import METADATA_FILE, read_metadata
-from nmpm.data.generate import generate
-from nmpm.data.simulation import SimulationRequest, same_trajectories
-from nmpm.scene import Scene
+from nmpm.data.simulation import SimulationRequest, generate, same_trajectories
 from nmpm.sim import load_preset
 
 
@@ -42,22 +39,10 @@ _OTHERS = {
 }
 
 
-@cache
-def catalog() -> tuple[str, ...]:
-    """Names of the embedded datasets."""
-    return preset_names()
-
-
 def describe(name: str) -> CatalogEntry:
     """The catalog's entry for an embedded dataset; raises a DataError if there is none of that name."""
     check_dataset(name)
     return _OTHERS.get(name, _USUAL)
-
-
-def scene(name: str) -> Scene:
-    """The scene of an embedded dataset; simulates nothing."""
-    describe(name)
-    return load_preset(name).scene
 
 
 def simulation_request(
@@ -104,7 +89,7 @@ def ensure(
     Trajectories do not depend on how many there are: those that another folder of it has are copied.
 
     Args:
-        name: One of `catalog()`.
+        name: One of `nmpm.sim.preset_names()`.
         counts: Trajectories in each of the splits train, valid and test; the dataset's own when left out.
         frames: Simulated frames of a trajectory; the preset's own when left out.
         seed: The seeds of all trajectories are derived from it; 0 when left out.

@@ -12,15 +12,12 @@ from lightning.pytorch import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
 
 from nmpm._support.plain_data import from_plain
+from nmpm.data.batches import PlanStart, RecordingProvider, TrajectoryBuffer, WindowPlan
 from nmpm.data.convert import Options
-from nmpm.data.loading.buffer import RecordingProvider, TrajectoryBuffer
-from nmpm.data.loading.evaluation import EvaluationLoader
-from nmpm.data.loading.model_frames import check_observed
-from nmpm.data.loading.padded_batch import pin_for
-from nmpm.data.loading.recording import SplitRecordings
-from nmpm.data.loading.sources import SourceName, hold_out, make_source
-from nmpm.data.loading.window_plan import PlanStart, WindowPlan
-from nmpm.data.split_files import split_paths
+from nmpm.data.format import split_paths
+from nmpm.data.recordings import EvaluationLoader, SplitRecordings
+from nmpm.data.sources import SourceName, hold_out, make_source
+from nmpm.data.windows import check_observed, pin_for
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
 from nmpm.scene import Boundary, Reading, Scene
@@ -116,17 +113,8 @@ class TrajectoryDataModule(LightningDataModule):
         reading: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        options = Options(
-            family,
-            prescribed=None if prescribed is None else frozenset(prescribed),
-            bounds=bounds,
-            gravity=gravity,
-            boundary=boundary,
-            fields=fields,
-            resample=resample,
-            smooth=smooth,
-            files=files,
-        )
+        facts = {"prescribed": prescribed, "bounds": bounds, "gravity": gravity, "boundary": boundary, "fields": fields}
+        options = Options.of(facts | {"family": family, "resample": resample, "smooth": smooth, "files": files})
         self.data_source = make_source(path, name, source, options, generate)
         if reading is not None:
             self.reading = from_plain(Reading, reading, "data.reading")

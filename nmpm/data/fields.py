@@ -41,53 +41,55 @@ class FieldFacts:
             return "evolving"
         return "parameter" if self.shape == (1, 1) else "property"
 
-    def add(self, values: np.ndarray) -> None:
-        """Adds a trajectory's values (T or 1, N or 1) of moving particles."""
-        if values.size:
-            self.low, self.high = min(self.low, float(values.min())), max(self.high, float(values.max()))
-            change = float(np.ptp(values, axis=0).max())
-            self.evolves |= change > _SAME * float(np.abs(values).max())
 
+class FieldSurvey(dict[str, FieldFacts]):
+    """What is known of a dataset's fields, by name, in the trajectories added so far."""
 
-def add_fields(
-    facts: dict[str, FieldFacts], split: Split, index: int, metadata: Metadata, names: Iterable[str]
-) -> None:
-    """Adds a trajectory's fields to the facts about the dataset's; names that it lacks are left out."""
-    moving = metadata.is_moving(split.particle_type(index))
-    for name, values in read_fields(split, index, names).items():
-        facts.setdefault(name, FieldFacts(values.shape)).add(values if values.shape[1] == 1 else values[:, moving])
+    def __init__(self, metadata: Metadata) -> None:
+        super().__init__()
+        self._metadata = metadata
+
+    def add(self, split: Split, index: int, names: Iterable[str]) -> None:
+        """Adds the named fields of a trajectory; those that it lacks are left out."""
+        for name, values in read_fields(split, index, names).items():
+            facts = self.setdefault(name, FieldFacts(values.shape))
+            if values.shape[1] > 1:
+                values = values[:, self._metadata.is_moving(split.particle_type(index))]
+            if values.size:
+                facts.low, facts.high = min(facts.low, float(values.min())), max(facts.high, float(values.max()))
+                facts.evolves |= float(np.ptp(values, axis=0).max()) > _SAME * float(np.abs(values).max())
+
+    def names(self, kind: Kind) -> tuple[str, ...]:
+        """Names of the fields of a kind."""
+        return tuple(name for name, facts in self.items() if facts.kind == kind)
 
 
 def read_fields(split: Split, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
     """The named fields that a trajectory has, (T, N), (1, N) or (1, 1) float32; a DataError for another shape."""
-    fields: dict[str, np.ndarray] = {}
-    where, sizes = split.where(index), (split.frames(index), split.particles(index))
-    with open_hdf5(split.path) as file:
-        group = file[split.names[index]]
-        for name in names:
-            values = group.get(name)
-            if values is not None and hasattr(values, "dtype"):
-                check_stored_size(values, f"{where}: {name}")
-                fields[name] = _arrange(split.cut(index, values[()]), sizes, f"{where}: {name}")
-            elif name in group.attrs:
-                fields[name] = _arrange(group.attrs[name], sizes, f"{where}: {name}")
-    return fields
-
-
-def _arrange(values: Any, sizes: tuple[int, int], where: str) -> np.ndarray:
-    """Values as (T, N), (1, N) or (1, 1)."""
-    array = np.asarray(values)
-    if array.dtype.kind in "biuf":
+    stored: dict[str, Any] = {}
+    if names := list(names):
+        with open_hdf5(split.path) as file:
+            group = file[split.names[index]]
+            for name in names:
+                values = group.get(name)
+                if values is not None and hasattr(values, "dtype"):
+                    check_stored_size(values, f"{split.where(index)}: {name}")
+                    stored[name] = split.cut(index, values)
+                elif name in group.attrs:
+                    stored[name] = group.attrs[name]
+    fields, sizes = dict[str, np.ndarray](), (split.frames(index), split.particles(index))
+    for name, values in stored.items():
+        array = np.asarray(values)
+        shape = {sizes: sizes, sizes[1:]: (1, *sizes[1:])}.get(array.shape)
         if array.size == 1 and array.ndim <= 1:
-            return array.reshape(1, 1).astype(np.float32)
-        if array.shape == sizes:
-            return array.astype(np.float32)
-        if array.shape == sizes[1:]:
-            return array[None].astype(np.float32)
-    raise DataError(
-        f"{where} is {array.dtype} of shape {array.shape}; a field is (T, N) = {sizes} numbers, ({sizes[1]},) or one."
-        " Store each component of a vector as a field of its own."
-    )
+            shape = (1, 1)
+        if shape is None or array.dtype.kind not in "biuf":
+            raise DataError(
+                f"{split.where(index)}: {name} is {array.dtype} of shape {array.shape}; a field is (T, N) = {sizes}"
+                f" numbers, ({sizes[1]},) or one. Store each component of a vector as a field of its own."
+            )
+        fields[name] = array.reshape(shape).astype(np.float32)
+    return fields
 
 
 def require_fields(split: Split, names: Sequence[str]) -> None:
@@ -104,15 +106,3 @@ def require_fields(split: Split, names: Sequence[str]) -> None:
                     f"{split.where(index)}: it has no field {', '.join(missing)}, which the metadata's `fields` or"
                     f" data.fields name (it has: {', '.join(stored) or 'none'}). Correct the name, or leave it out."
                 )
-
-
-def check_finite(name: str, values: np.ndarray, moving: np.ndarray, where: str) -> None:
-    """Raises a DataError if a field (T, N') of the moving particles, (N,) of which N' are, is not finite."""
-    wrong = ~np.isfinite(values)
-    if wrong.any():
-        frame, index = map(int, np.argwhere(wrong)[0])
-        particle = int(np.flatnonzero(moving)[index])
-        raise DataError(
-            f"{where}: {name} of particle {particle} in frame {frame} is {values[frame, index]}; fields of moving"
-            " particles must be finite. Remove the trajectory, or leave the field out of data.fields."
-        )

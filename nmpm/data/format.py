@@ -11,7 +11,7 @@ A particle that is not there in a frame has NaN in all coordinates of its positi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -31,17 +31,65 @@ from nmpm.data.hdf5 import (
 )
 from nmpm.data.metadata import METADATA_FILE as METADATA_FILE
 from nmpm.data.metadata import Metadata as Metadata
-from nmpm.data.metadata_json import read_metadata as read_metadata
-from nmpm.data.metadata_json import write_metadata as write_metadata
-from nmpm.data.split_files import describe_others, split_paths
+from nmpm.data.metadata import read_metadata as read_metadata
+from nmpm.data.metadata import write_metadata as write_metadata
 from nmpm.errors import DataError
+
+SPLITS = ("train", "valid", "test")
+OTHER_NAMES = {
+    "train": ("training", "trn"),
+    "valid": ("val", "validation", "eval", "dev"),
+    "test": ("testing", "tst"),
+}
+
+_NO_DATA = frozenset({"Thumbs.db", "desktop.ini", "__MACOSX"})
+
+
+def is_no_data(name: str) -> bool:
+    """Whether files and folders of a name are hidden, or left by a system's file manager or archiver."""
+    return name.startswith(".") or name in _NO_DATA
+
+
+def describe_others(folder: Path) -> str:
+    """The HDF5 files that a folder has, in brackets, for messages; nothing if there are none."""
+    names = sorted(file.name for file in folder.glob("*.h5"))
+    return f" (beside it: {', '.join(names)})" if names else ""
+
+
+def split_paths(folder: Path) -> Mapping[str, Path]:
+    """The split files in a dataset's folder, by name, in the order train, valid, test."""
+    paths = {name: Path(folder) / f"{name}.h5" for name in SPLITS}
+    return {name: path for name, path in paths.items() if path.exists()}
+
+
+def find_split(folder: Path, *names: str) -> Path:
+    """The file of the first of the named splits that a folder has; if none, a DataError names those there are."""
+    paths = split_paths(folder)
+    for name in names:
+        if name in paths:
+            return paths[name]
+    missing = " or ".join(f"{name}.h5" for name in names)
+    renames = "".join(f" {rename}" for rename in split_renames(folder, names))
+    raise DataError(f"{folder}: no {missing} there{describe_others(Path(folder))}.{renames}")
+
+
+def split_renames(folder: Path, names: Iterable[str] = SPLITS) -> list[str]:
+    """Advice to rename files such as `val.h5`, a sentence for each, where the named split is missing."""
+    paths = split_paths(folder)
+    return [
+        f"Rename {other}.h5 to {name}.h5."
+        for name in names
+        for other in OTHER_NAMES[name]
+        if name not in paths and (Path(folder) / f"{other}.h5").is_file()
+    ]
+
 
 TRUTH = "truth"
 """Dataset of a prediction's group: the recorded positions (T', N, D) beside those that were predicted."""
 MEMBER = "member"
 """Attribute of a trajectory that is a member of an ensemble: its number, from 0; neighbours count up."""
 VTKHDF = "VTKHDF"
-"""Group by which ParaView reads a file, see `nmpm.data.write.vtkhdf`; it is not a trajectory."""
+"""Group by which ParaView reads a file, see `nmpm.data.write.vtk`; it is not a trajectory."""
 ID = "id"
 """Dataset of the numbers or texts (N,) that the particles have in the data; (T, N) texts beside `track`."""
 TRACK = "track"
@@ -215,7 +263,7 @@ class Split:
                 stored = file[self._entries[index].name].get(name)
                 if isinstance(stored, h5py.Dataset) and stored.shape in (sizes, sizes[1:]):
                     check_stored_size(stored, f"{self.where(index)}: {name}")
-                    return self.cut(index, np.asarray(stored[()]))
+                    return np.asarray(self.cut(index, stored))
         return np.arange(sizes[1])
 
     def _numbers(self, index: int, name: str, shape: tuple[int, ...], kinds: str) -> np.ndarray | None:
@@ -241,13 +289,13 @@ class Split:
                 if name not in CORE and isinstance(group[name], h5py.Dataset):
                     check_field(name, group[name], self.where(index))
                     check_stored_size(group[name], f"{self.where(index)}: {name}")
-                    fields[name] = self.cut(index, np.asarray(group[name][()]))
+                    fields[name] = np.asarray(self.cut(index, group[name]))
         return fields
 
-    def cut(self, index: int, values: np.ndarray) -> np.ndarray:
-        """The frames that count of a field's values; those that have none as they are."""
+    def cut(self, index: int, values: Any) -> Any:
+        """The frames that count of a field's values, an array or a dataset; all values where they are not by frame."""
         entry = self._entries[index]
-        return values[self.span] if values.shape[:2] == (entry.frames, entry.particles) else values
+        return values[self.span if values.shape[:2] == (entry.frames, entry.particles) else ()]
 
     def read_with_fields(self, index: int) -> Trajectory:
         """Reads a trajectory with its fields."""

@@ -66,10 +66,6 @@ class TrainingSize:
         """That of the shipped configurations in so many dimensions."""
         return cls(4, 2, 24) if dim == 3 else cls(8, 4, 32)
 
-    def with_unroll(self, unroll: int) -> TrainingSize:
-        """The same for another number of bundles."""
-        return replace(self, unroll=unroll)
-
     def seconds(self, shape: Sequence[int], particles: int) -> float:
         """Seconds of a step on one core of an AMD EPYC in float32, to 30%; other machines differ by a factor."""
         particle_seconds = _PARTICLE_SECONDS * particles * self.batch_size * self.unroll
@@ -113,8 +109,8 @@ class GridCost:
 
 
 def grid_cost(shape: Sequence[int], particles: int, machine: Machine, size: TrainingSize | None = None) -> GridCost:
-    """The cost of a training on a grid with so many moving particles in a trajectory."""
-    size = size or TrainingSize.of(len(shape))
+    """The cost of a training on a grid with so many moving particles in a trajectory, of the size that suits both."""
+    size = size or training_size(shape, particles, machine)
     seconds, memory = machine.slowness * size.seconds(shape, particles), size.memory(shape)
     return GridCost(seconds, machine.steps(seconds), memory, memory <= MEMORY_SHARE * machine.memory)
 
@@ -138,7 +134,7 @@ def recommended_cells(grids: Sequence[GridFacts], particles: int, machine: Machi
     target = (PER_AXIS * (machine.minutes / MINUTES) ** -GROWTH) ** dim
 
     def suits(grid: GridFacts) -> bool:
-        cost = grid_cost(grid.shape, particles, machine, training_size(grid.shape, particles, machine))
+        cost = grid_cost(grid.shape, particles, machine)
         enough = grid.cells >= LEAST_CELLS[dim] and grid.high_speed <= MOST_SPEED
         return enough and cost.fits and cost.steps >= LEAST_STEPS
 

@@ -1,21 +1,70 @@
-"""Predictions as trajectories in the native format, with all that is needed to draw or reuse them."""
+"""Predictions as trajectories in the native layout, which bring their scene's facts along as attributes."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Any
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from nmpm._support.version import __version__
-from nmpm.data.format import TRUTH, Trajectory
-from nmpm.data.metadata import FAMILIES
-from nmpm.errors import DataError
-from nmpm.particles import Particles
+from nmpm.data.format import TRUTH, Metadata, Trajectory
+from nmpm.data.metadata import JsonKeys, parse_json, scene_metadata
+from nmpm.data.stated import FAMILIES
+from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from nmpm.particles import Particles
+
+DESCRIPTION = ("scene", "particle_types", "static_types", "prescribed_types")
+"""Names of these attributes."""
+
+
+def description(trajectory: Trajectory, metadata: Metadata, particle_volume: float) -> dict[str, Any]:
+    """The attributes `scene`, `particle_types`, in JSON, and ids of types of a trajectory of a dataset."""
+    types = np.unique(trajectory.particle_type).tolist()
+    varies = "gravity" in trajectory.attributes
+    scene = metadata.scene(types, particle_volume=particle_volume, gravity_varies=varies)
+    prescribed = np.array(sorted(metadata.prescribed_types), dtype=np.int64)
+    return ({"prescribed_types": prescribed} if len(prescribed) else {}) | {
+        "scene": json.dumps(scene.to_dict()),
+        "particle_types": json.dumps(metadata.particle_types),
+        "static_types": np.array(sorted(metadata.static_types), dtype=np.int64),
+    }
+
+
+def read_description(attributes: Mapping[str, Any], path: Path, frames: int) -> tuple[Scene, Metadata]:
+    """The scene of trajectories with a description, and the metadata of a dataset of them, of so many frames.
+
+    Raises:
+        DataError: naming the file, if an attribute is missing or wrong.
+    """
+    texts = {key: attributes.get(key) for key in ("scene", "particle_types")}
+    if wrong := [key for key, text in texts.items() if not isinstance(text, str)]:
+        raise DataError(f"{path}: the attribute {wrong[0]} of a prediction should be a text, in JSON.")
+    plain, names = (parse_json(str(text), f"{path}, {key}") for key, text in texts.items())
+    ids = {
+        "static_types": np.asarray(attributes.get("static_types")).tolist(),
+        "prescribed_types": np.asarray(attributes.get("prescribed_types", [])).tolist(),
+    }
+    keys = JsonKeys(path, {"particle_types": names} | ids)
+    try:
+        scene = Scene.from_dict(plain)
+    except ConfigError as error:
+        raise DataError(f"{path}: {error}") from error
+    static, prescribed = (keys.take(key) for key in ids)
+    metadata = scene_metadata(scene, keys.take("particle_types"), None)
+    # A description declares no inputs of models.
+    return scene, replace(
+        metadata, sequence_length=frames - 1, static_types=static, prescribed_types=prescribed, fields=()
+    )
+
 
 BOUNDARY = 3  # DeepMind's id of particles that do not move
 MOVING_WALL = 2  # LagrangeBench's id of those that move as prescribed
@@ -51,6 +100,8 @@ def predicted_trajectory(
     Raises:
         DataError: if the state has bodies, which no file can hold as such.
     """
+    import torch  # (files of predictions are read without it)
+
     if state.obstacle_share is not None:
         raise DataError(
             "The state has obstacles as bodies, of which a file could hold no shapes: fill them with particles,"
@@ -95,5 +146,7 @@ def _with_obstacle(moving: Tensor, obstacle: np.ndarray) -> np.ndarray:
 
 def _field_frames(start: Tensor, predicted: Tensor, real: Tensor, obstacles: int) -> np.ndarray:
     """(T + 2, N + M) values of a scene: those of the start (N,) or (1,) twice, then (T, N) predicted ones."""
+    import torch
+
     frames = torch.cat([start.expand(2, predicted.shape[1]), predicted])[:, real].cpu().numpy()
     return np.pad(frames.astype(np.float32), ((0, 0), (0, obstacles)), constant_values=np.nan)

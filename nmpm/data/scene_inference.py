@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from nmpm.data.array_checks import particles_far_away
 from nmpm.data.convert.base import Options
-from nmpm.data.fields import FieldFacts, Kind, add_fields, require_fields
-from nmpm.data.format import METADATA_FILE, Metadata, Split, read_metadata
+from nmpm.data.fields import FieldSurvey, require_fields
+from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, read_metadata
 from nmpm.data.gravity import check_gravity, common_gravity, distinct_gravities, trajectory_gravity
-from nmpm.data.split_files import SPLITS, find_split
 from nmpm.data.statistics import Extent, neighbour_distance, without_those_gone
 from nmpm.errors import DataError
 from nmpm.scene import Interval, Scene
@@ -40,10 +41,10 @@ def infer_scene(folder: Path, options: Options | None = None) -> Scene:
         ConfigError: if an option does not match the number of axes, is invalid, or contradicts the files' gravity.
     """
     folder, options = Path(folder), options or Options()
-    stated = read_metadata(folder, options.family, options.types)
+    stated, where = read_metadata(folder, options.family, options.types), folder / METADATA_FILE
     metadata = options.apply_to(stated)
     if options.gravity is not None:
-        check_gravity(options.gravity, stated.gravity, folder / METADATA_FILE)
+        check_gravity(options.gravity, stated.gravity, where)
     split = Split(find_split(folder, *SPLITS))
     if split.dim != metadata.dim:
         raise DataError(
@@ -54,106 +55,73 @@ def infer_scene(folder: Path, options: Options | None = None) -> Scene:
         particle_type = split.particle_type(index)
         metadata.check_types(particle_type, split.where(index))
         types.update(np.unique(particle_type).tolist())
-    sample = split.sample(_SAMPLE_BYTES)
+    if not types & set(metadata.moving_types):
+        raise DataError(f"{split.path}: no particle has a moving type; check static_types in {METADATA_FILE}.")
+    require_fields(split, metadata.fields)
+    sample, fields = split.sample(_SAMPLE_BYTES), FieldSurvey(metadata)
     moving, everything = Extent(metadata.dim), Extent(metadata.dim)
     for index in sample:
         trajectory = split.read(index)
-        moves, is_obstacle = (
-            metadata.is_moving(trajectory.particle_type),
-            metadata.is_obstacle(trajectory.particle_type),
-        )
+        moves = metadata.is_moving(trajectory.particle_type)
         position = without_those_gone(trajectory.position, metadata)
         if (far := particles_far_away(position)).any():  # an inspection names these
             position = np.where(far[..., None], np.nan, position)
         moving.add(position[:, moves])
-        everything.add(position[:, moves | is_obstacle])
-    bounds, domain = _extents(metadata, moving, everything, folder)
+        everything.add(position[:, moves | metadata.is_obstacle(trajectory.particle_type)])
+        fields.add(split, index, metadata.fields)
     gravities = distinct_gravities(
         trajectory_gravity(split.attributes(index), metadata, split.where(index)) for index in range(len(split))
     )
     if options.gravity is not None:
         for other in gravities:
             check_gravity(options.gravity, other, split.path)
-    materials = tuple(dict.fromkeys(metadata.particle_types[i] for i in metadata.moving_types if i in types))
-    if not materials:
-        raise DataError(f"{split.path}: no particle has a moving type; check static_types in {METADATA_FILE}.")
-    densities = tuple(metadata.densities[name] for name in materials if name in metadata.densities)
-    kinds = _kinds_of_fields(split, sample, metadata)
     volume = metadata.particle_volume or neighbour_distance(split, sample, metadata) ** metadata.dim
     if volume <= 0:
         raise DataError(
-            f"{folder / METADATA_FILE}: the volume of a particle cannot be estimated from the distances between them;"
+            f"{where}: the volume of a particle cannot be estimated from the distances between them;"
             ' add it, e.g. "particle_volume": 6.4e-5 (length ** dim).'
         )
-    return Scene(
+    bounds, domain = zip(*_extents(metadata, moving.intervals, everything.intervals, where), strict=True)
+    scene = metadata.scene(
+        types,
         bounds=bounds,
         domain=domain,
-        dt=metadata.dt,
-        materials=materials,
         particle_volume=volume,
-        boundary=metadata.boundary,
         gravity=common_gravity(gravities, metadata, split),
         gravity_varies=len(gravities) > 1,
-        obstacles=bool(types & metadata.obstacle_types),
-        moving_obstacles=bool(types & metadata.prescribed_types),
-        densities=densities if 1 < len(densities) == len(materials) else (),
-        evolving=tuple(name for name, kind in kinds.items() if kind == "evolving"),
-        properties=tuple(name for name, kind in kinds.items() if kind == "property"),
-        parameters=tuple(name for name, kind in kinds.items() if kind == "parameter"),
+        evolving=fields.names("evolving"),
+        properties=fields.names("property"),
+        parameters=fields.names("parameter"),
     )
-
-
-def _kinds_of_fields(split: Split, sample: range, metadata: Metadata) -> dict[str, Kind]:
-    """The kinds of the declared fields, in their order."""
-    require_fields(split, metadata.fields)
-    facts: dict[str, FieldFacts] = {}
-    for index in sample if metadata.fields else ():
-        add_fields(facts, split, index, metadata, metadata.fields)
-    return {name: facts[name].kind for name in metadata.fields}
+    densities = tuple(metadata.densities[name] for name in scene.materials if name in metadata.densities)
+    return replace(scene, densities=densities) if 1 < len(densities) == len(scene.materials) else scene
 
 
 def _extents(
-    metadata: Metadata, moving: Extent, everything: Extent, folder: Path
-) -> tuple[tuple[Interval, ...], tuple[Interval, ...]]:
-    """Bounds and domain, (lower, upper) per axis."""
-    stated = metadata.domain or (None,) * metadata.dim
-    pairs = list[tuple[Interval, Interval]]()
+    metadata: Metadata, moving: Sequence[Interval], everything: Sequence[Interval], where: Path
+) -> Iterator[tuple[Interval, Interval]]:
+    """Yields bounds and domain, (lower, upper) each, of each axis."""
     for axis, (bounds, kind) in enumerate(zip(metadata.bounds, metadata.boundary, strict=True)):
+        (low, high), (lowest, highest), domain = bounds, everything[axis], metadata.domain and metadata.domain[axis]
         if kind == "periodic":
-            pairs.append(_periodic_extent(bounds, stated[axis], axis, folder))
-        elif kind == "open":
-            pairs.append((bounds, stated[axis] or bounds))
-        else:
-            seen = moving.intervals[axis], everything.intervals[axis]
-            pairs.append(_walled_extent(bounds, stated[axis], *seen, axis, folder))
-    return tuple(pair[0] for pair in pairs), tuple(pair[1] for pair in pairs)
-
-
-def _periodic_extent(bounds: Interval, stated: Interval | None, axis: int, folder: Path) -> tuple[Interval, Interval]:
-    if stated is not None and not np.allclose(bounds, stated, rtol=0, atol=1e-6 * (stated[1] - stated[0])):
-        raise DataError(
-            f"{folder / METADATA_FILE}: axis {axis} is periodic, but its bounds {list(bounds)} and domain"
-            f" {list(stated)} have different ends. Make them the same, one period apart, or leave the domain out, so"
-            " that the bounds are the period."
-        )
-    return stated or bounds, stated or bounds
-
-
-def _walled_extent(
-    bounds: Interval, stated: Interval | None, moving: Interval, everything: Interval, axis: int, folder: Path
-) -> tuple[Interval, Interval]:
-    low, high = bounds
-    seen_low, seen_high = everything
-    widened = (min(low, moving[0]), max(high, moving[1]))
-    if stated is not None:
-        if seen_low < stated[0] or seen_high > stated[1]:
+            if domain and not np.allclose(bounds, domain, rtol=0, atol=1e-6 * (domain[1] - domain[0])):
+                raise DataError(
+                    f"{where}: axis {axis} is periodic, but its bounds {list(bounds)} and domain {list(domain)} have"
+                    " different ends. Make them the same, one period apart, or leave the domain out, so that the"
+                    " bounds are the period."
+                )
+            yield domain or bounds, domain or bounds
+            continue
+        if kind == "open":
+            yield bounds, domain or bounds
+            continue
+        if domain and (lowest < domain[0] or highest > domain[1]):
             raise DataError(
-                f"{folder / METADATA_FILE}: domain {list(stated)} on axis {axis} does not contain the positions, which"
-                f" reach from {seen_low:.6g} to {seen_high:.6g}. Widen it."
+                f"{where}: domain {list(domain)} on axis {axis} does not contain the positions, which reach from"
+                f" {lowest:.6g} to {highest:.6g}. Widen it."
             )
-        return widened, stated
-    layer = _WALL_LAYER * (high - low)
-    # If particles are beyond the layer, the stated bounds are not the walls: put the layer around the particles.
-    lower = low - layer if seen_low >= low - layer else seen_low - layer
-    upper = high + layer if seen_high <= high + layer else seen_high + layer
-    return widened, (lower, upper)
+        layer = _WALL_LAYER * (high - low)
+        # If particles are beyond the layer, the stated bounds are not the walls: put the layer around the particles.
+        lower = low - layer if lowest >= low - layer else lowest - layer
+        upper = high + layer if highest <= high + layer else highest + layer
+        yield (min(low, moving[axis][0]), max(high, moving[axis][1])), domain or (lower, upper)

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.errors import DataError
 from nmpm.scene import Boundary, Interval, Scene
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 STATISTICS_KEYS = ("vel_mean", "vel_std", "acc_mean", "acc_std")
 FINE_STEPS = 1000.0
@@ -129,6 +131,8 @@ def relative_positions(position: np.ndarray, metadata: Metadata) -> np.ndarray:
 
 def neighbour_tree(position: np.ndarray, metadata: Metadata) -> cKDTree:
     """A search tree of (N, D) positions, relative to the bounds, that wraps on periodic axes."""
+    from scipy.spatial import cKDTree  # takes 0.2 s, which loading a model need not wait for
+
     lower, upper = np.asarray(metadata.bounds, dtype=np.float64).T
     period = np.where(metadata.periodic, upper - lower, 0.0)  # cKDTree: 0 is not periodic
     return cKDTree(relative_positions(position, metadata), boxsize=period)
@@ -154,6 +158,11 @@ def displacements(position: np.ndarray, metadata: Metadata) -> np.ndarray:
         period = upper[axis] - lower[axis]
         step[..., axis] -= period * np.round(step[..., axis] / period)
     return step
+
+
+def lengths(vectors: np.ndarray) -> np.ndarray:
+    """(…) lengths of (…, D) vectors."""
+    return np.asarray(np.sqrt(np.einsum("...d,...d->...", vectors, vectors)))
 
 
 class MotionStatistics:
@@ -290,3 +299,17 @@ def count_gone(position: np.ndarray, metadata: Metadata) -> int:
     """Number of particles of which `without_those_gone` leaves positions out."""
     kept = without_those_gone(position, metadata)
     return 0 if kept is position else int((np.isnan(kept[..., 0]) > np.isnan(position[..., 0])).any(axis=0).sum())
+
+
+def roundest(low: float, high: float) -> float:
+    """The number in [low, high] with the fewest digits; of equally round ones that closest to the middle."""
+    middle = (low + high) / 2
+    if low <= 0 <= high or not high > low:
+        return 0.0 if low <= 0 <= high else middle
+    for digits in range(-12, 16):
+        unit = 10.0 ** -(digits - math.ceil(math.log10(max(abs(low), abs(high)))))
+        for step in (unit, unit / 2):
+            value = round(middle / step) * step
+            if low <= value <= high:
+                return float(f"{value:.12g}")
+    return middle

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -10,7 +12,12 @@ import numpy as np
 from nmpm._support.messages import one_line
 from nmpm.data.format import Metadata, Split, Trajectory
 from nmpm.data.hdf5 import check_stored_size, open_hdf5
+from nmpm.data.metadata import Fact
 from nmpm.errors import DataError
+
+if TYPE_CHECKING:
+    from nmpm.data.facts import Sample
+
 
 SIZES = ("volume", "radius", "diameter", "size")
 """Names of fields that say how large particles are; the first that a trajectory has counts."""
@@ -89,19 +96,15 @@ def relative_volumes(trajectory: Trajectory, moving: np.ndarray) -> np.ndarray |
     return values / values.mean() if values.max() > _VARIES * values.min() else None
 
 
-def _volumes_of(name: str, sizes: Any, dim: int) -> np.ndarray | None:
-    values = _constant(sizes)
-    return values if values is None or name == "volume" else values**dim
-
-
-def _constant(stored: Any) -> np.ndarray | None:
-    """(N,) values, NaN where one is not positive; None if they are no numbers or change in time."""
+def _volumes_of(name: str, stored: Any, dim: int) -> np.ndarray | None:
+    """(N,) volumes, NaN where a size is not positive; None if sizes are no numbers or change in time."""
     if stored.dtype.kind not in "iuf":
         return None
     values = np.atleast_2d(np.asarray(stored[()], dtype=np.float64))
     low, high = np.fmin.reduce(values, axis=0), np.fmax.reduce(values, axis=0)
-    changes = high - low > _CONSTANT * np.abs(high)
-    return None if changes.any() else np.where(low > 0, low, np.nan)
+    if (high - low > _CONSTANT * np.abs(high)).any():
+        return None
+    return np.where(low > 0, low, np.nan) ** (1 if name == "volume" else dim)
 
 
 def check_positive(volume: np.ndarray, moving: np.ndarray, where: str) -> np.ndarray:
@@ -113,3 +116,73 @@ def check_positive(volume: np.ndarray, moving: np.ndarray, where: str) -> np.nda
             " number. Correct the field, or rename it if it is no size."
         )
     return np.asarray(volume[moving], dtype=np.float32)
+
+
+_LATTICE = 0.05  # the two estimates differ by less on a lattice
+_SETTLED = 3.0  # volume in first frames over that in last ones, if particles start loosely and settle
+_NEIGHBOURS = 24
+_POINTS = 4000
+_CENTRED = 0.2  # of a ball's radius: mean offset of the particles in it, where it is full
+
+
+def find_particle_volume(samples: Iterable[Sample], materials: frozenset[int]) -> Fact[float | None]:
+    """The volume of a particle in length ** dim, from first frames, or from last ones where particles settle."""
+    first, last = zip(*((sample.first.of(materials), sample.last.of(materials)) for sample in samples), strict=True)
+    nearest, dense = _medians(nearest_volume, first), _medians(density_volume, first)
+    nearest_late, dense_late = _medians(nearest_volume, last), _medians(density_volume, last)
+    if not nearest:
+        return Fact(None, "no two particles are there in a first frame.", "guessed")
+    if not dense:
+        return Fact(nearest, "as on a lattice, by the distance of nearest neighbours in first frames.", "likely")
+    how = "in first frames, by"
+    if dense_late and dense > _SETTLED * dense_late:
+        how = (
+            f"particles are {dense / dense_late:.1f} times denser in last frames than in first ones, where each has a"
+            f" volume of {dense:.3g}; this is the volume in last frames, by"
+        )
+        nearest, dense = nearest_late, dense_late
+    if abs(nearest / dense - 1) < _LATTICE:
+        how = f"{how} the distance of nearest neighbours; particles per volume give {dense:.4g}."
+        return Fact(nearest, how, "measured")
+    how = f"{how} particles per volume; nearest neighbours on a lattice would give {nearest:.4g}."
+    return Fact(dense, how, "likely")
+
+
+def _medians(estimate: Callable[[np.ndarray], float], clouds: Sequence[np.ndarray]) -> float:
+    values = [estimate(cloud) for cloud in clouds if len(cloud) > 1]
+    values = [value for value in values if value > 0]
+    return float(np.median(values)) if values else 0.0
+
+
+def nearest_volume(position: np.ndarray) -> float:
+    """(Median distance of (N, D) particles to the nearest other one) ** dim; 0 where most coincide with another."""
+    from scipy.spatial import cKDTree  # takes 0.2 s, which loading a model need not wait for
+
+    some = position[:: -(-len(position) // _POINTS)]
+    distance = cKDTree(position).query(some, k=2)[0][:, 1]
+    return float(np.median(distance) ** position.shape[1])
+
+
+def density_volume(position: np.ndarray) -> float:
+    """Volume per particle amid (N, D) particles: of balls with about 24 in them; 0 where there are too few.
+
+    Balls around random points near particles count where they are full: where the particles in them are centred.
+    """
+    from scipy.spatial import cKDTree
+
+    count, dim = position.shape
+    if count < 2 * _NEIGHBOURS:
+        return 0.0
+    rng, tree = np.random.default_rng(0), cKDTree(position)
+    centres = position[rng.integers(count, size=_POINTS)]
+    spread = tree.query(centres, k=4)[0][:, -1:]
+    centres = centres + rng.uniform(-0.5, 0.5, centres.shape) * spread
+    distance, index = tree.query(centres, k=_NEIGHBOURS)
+    # Half-way between the last two, so that lattices' shells are not preferred.
+    radius = distance[:, -2:].mean(axis=1)
+    offset = np.linalg.norm(position[index[:, :-1]].mean(axis=1) - centres, axis=1)
+    full = (offset < _CENTRED * radius) & (radius > 0)
+    if full.sum() < _POINTS // 100:
+        return 0.0
+    ball = math.pi ** (dim / 2) / math.gamma(dim / 2 + 1) * radius[full] ** dim
+    return float(np.median(ball)) / (_NEIGHBOURS - 1)

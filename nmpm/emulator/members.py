@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nmpm._support.numbers import check_whole, is_finite
+from nmpm._support.plain_data import check_whole, is_finite
 from nmpm.emulator.constraints import distance_beyond
 from nmpm.emulator.engines.torch.contact import Contact, obstacle_share
 from nmpm.emulator.model import Emulator

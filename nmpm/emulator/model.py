@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from torch import Tensor, nn
 
-from nmpm._support.devices import copy_to
+from nmpm._support.machine import copy_to
 from nmpm._support.threads import ThreadChoice
 from nmpm.decoders import Decoder
 from nmpm.emulator.bundle import Bundle as Bundle

@@ -11,8 +11,7 @@ from nmpm.emulator.fields import FieldScales
 from nmpm.grid import Grid
 from nmpm.particles import Particles
 from nmpm.scene import Scene
-from nmpm.transfer import Transfer
-from nmpm.transfer.transfer import divisors
+from nmpm.transfer import Transfer, divisors
 
 
 def grid_state(

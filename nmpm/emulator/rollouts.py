@@ -10,16 +10,15 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from nmpm._support.numbers import check_whole
+from nmpm._support.plain_data import check_whole
 from nmpm.emulator.bundle import Bundle, RolloutContext
-from nmpm.emulator.input_checks import check_inputs, warn_of_training_mode
 from nmpm.emulator.model import Emulator
-from nmpm.emulator.monitor import Monitor
+from nmpm.emulator.monitor import Monitor, check_inputs, warn_of_training_mode
 from nmpm.emulator.noise import Noise
 from nmpm.emulator.periods import Periods
 from nmpm.emulator.prescribed import Exchange, Prescribed
 from nmpm.particles import Particles
-from nmpm.transfer.execution import is_eager_cpu
+from nmpm.transfer import is_eager_cpu
 
 Call = Callable[[Emulator, Particles, RolloutContext], Bundle]
 

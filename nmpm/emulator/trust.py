@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from nmpm._support.numbers import check_whole, is_finite
+from nmpm._support.plain_data import check_whole, is_finite
 from nmpm.emulator.members import mean_pair_distance, stream_members
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import ctypes
-import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
 
-from nmpm._support.devices import processor_name
+from nmpm._support.machine import device_name, processor_name
 
 Action = Callable[[], object]
 Clock = Callable[[], float]
@@ -77,8 +77,15 @@ def is_machine_failure(error: BaseException) -> bool:
 
 def describe_device(device: torch.device) -> str:
     """Name of the processor or GPU."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    if device.type == "mps":
-        return f"Apple GPU ({platform.processor()})"
-    return processor_name()
+    return processor_name() if device.type == "cpu" else device_name(device)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch's operations use one thread."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nmpm.data.loading.model_frames import interpolate, model_velocity
+from nmpm.data.windows import interpolate, model_velocity
 from nmpm.emulator import Emulator, Prescribed, rollout
 from nmpm.emulator.prescribed import predict_from_entries
 from nmpm.particles import Particles, Window

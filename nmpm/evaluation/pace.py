@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import torch
 
-from nmpm._support.devices import computes_bfloat16, find_device
-from nmpm._support.memory import free_memory
+from nmpm._support.machine import computes_bfloat16, find_device, free_memory
 from nmpm._support.threads import stated_threads, usable_cores
 from nmpm.data.grid_rule import MINUTES, Machine, TrainingSize
-from nmpm.evaluation.machine import clock_for
+from nmpm.evaluation.machine import clock_for, one_thread
 from nmpm.processors import UNet
 from nmpm.processors.base import GridLayout
 
@@ -47,14 +43,3 @@ def measure_machine(dim: int, minutes: float = MINUTES) -> Machine:
     pace = size.unroll * fastest / (1 + _THREADS_GAIN * (threads - 1))
     memory = float(torch.cuda.mem_get_info(device)[0]) if device.type == "cuda" else free_memory()
     return Machine(pace / size.network_seconds(shape), memory, minutes)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let torch's operations use one thread."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nmpm.grid import counting_grid
-from nmpm.metrics import earth_mover_of_materials
+from nmpm.metrics import check_emd, earth_mover_of_materials
 from nmpm.metrics.ensembles import fair_crps, measure_quantities
 from nmpm.metrics.quantities import energies, into_domain, measure_shape, volume_fractions
 from nmpm.particles import Window
@@ -53,6 +53,10 @@ class Measures:
     emd_frames: int = 1
     emd_particles: int | None = None
     crps: bool = False
+
+    def __post_init__(self) -> None:
+        if self.emd_frames:
+            check_emd()
 
     def to_dict(self) -> dict[str, Any]:
         """The settings as plain data."""

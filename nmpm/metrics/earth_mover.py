@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
+from nmpm._support.messages import require
 from nmpm.errors import NmpmError
 from nmpm.metrics.base import RolloutMetric
 from nmpm.particles import Window
@@ -37,6 +38,7 @@ class EarthMover(RolloutMetric):
     distances: list[Tensor] | Tensor  # one tensor once gathered from several processes
 
     def __init__(self, every: int = 10) -> None:
+        check_emd()
         super().__init__()
         self.every = every
         self.add_state("distances", default=[], dist_reduce_fx="cat")
@@ -60,6 +62,11 @@ class EarthMover(RolloutMetric):
         return {"emd": dim_zero_cat(self.distances).cpu().double().mean().float()}
 
 
+def check_emd() -> None:
+    """Raise ConfigError if POT, which computes earth mover's distances, is not installed."""
+    require("ot", "emd", "The earth mover's distance")
+
+
 def earth_mover(ours: Tensor, theirs: Tensor, there: Tensor | None = None, volume: Tensor | None = None) -> float:
     """Mean over frames of the exact earth mover's distance between two clouds (T, N, D) of equal size, in their length.
 
@@ -78,6 +85,7 @@ def earth_mover(ours: Tensor, theirs: Tensor, there: Tensor | None = None, volum
 
 def _match(cost: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
     """The least mean cost of moving weights (N,) from the rows to the columns of an (N, N) matrix."""
+    check_emd()
     from ot import emd2  # takes half a second to import
 
     share = weight / weight.sum()

@@ -1,4 +1,4 @@
 """The emulator live in a browser: `nmpm play`.
 
-`messages` reads what a page sends, `session` applies it and answers with frames, `server` carries both.
+`session` applies what a page sends to the scene of `world` and answers with frames; `server` carries both.
 """

@@ -12,7 +12,7 @@ from torch import Tensor
 from nmpm._support.messages import one_line
 from nmpm.emulator.calibration import calibrated_range
 from nmpm.errors import ConfigError
-from nmpm.play.commands import Pour, Throw
+from nmpm.play.placing import Pour
 
 if TYPE_CHECKING:
     from nmpm.zoo import Pretrained
@@ -37,16 +37,18 @@ class Limits:
         self.most_particles = min(MOST_PARTICLES, int(_FILLED * self.scene.volume / self.scene.particle_volume))
         self._sides = [high - low for low, high in self.scene.bounds]
 
-    def check_throw(self, throw: Throw) -> None:
+    def check_throw(
+        self, material: int, at: Sequence[float], sides: Sequence[float], velocity: Sequence[float]
+    ) -> None:
         """Raise ConfigError for a block of another material, too large, or too fast."""
-        self._check_material(throw.material)
-        self.check_vector("at", throw.at)
-        self.check_vector("sides", throw.sides)
-        self._check_velocity(throw.material, throw.velocity)
-        width, most = _numbers(throw.sides), max(self._sides)
-        if not all(0 < side <= most for side in throw.sides):
+        self._check_material(material)
+        self.check_vector("at", at)
+        self.check_vector("sides", sides)
+        self._check_velocity(material, velocity)
+        width, most = _numbers(sides), max(self._sides)
+        if not all(0 < side <= most for side in sides):
             raise ConfigError(f"a block {width} wide: each side must be positive, and at most {most:g}")
-        if math.prod(throw.sides) / self.scene.particle_volume > self.most_particles:
+        if math.prod(sides) / self.scene.particle_volume > self.most_particles:
             raise ConfigError(f"a block {width} wide has more than {self.most_particles} particles")
 
     def check_pour(self, pour: Pour) -> None:

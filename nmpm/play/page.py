@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from functools import cache
-from importlib.resources import files
 
-VIEWER = "nmpm.viz.viewer"
+from nmpm.viz.viewer.page import fill_page, read_asset
+
+FILES = f"{__package__}.page_files"
 VIEWER_SCRIPTS = ("data.js", "matrices.js", "drawing.js", "layout.js", "curve.js", "legend.js")
 """Of the viewer: how particles and walls are drawn, and where; what the colours stand for."""
 SCRIPTS = ("stage.js", "bodies.js", "pointer.js", "play.js")
@@ -15,21 +16,17 @@ SCRIPTS = ("stage.js", "bodies.js", "pointer.js", "play.js")
 @cache
 def page() -> str:
     """The page's text."""
-    return fill(read("play.html"), {"/*SCRIPT*/": scripts(SCRIPTS)})
+    return fill(read_asset("play.html", FILES), {"/*SCRIPT*/": scripts(SCRIPTS)})
 
 
 def fill(text: str, contents: Mapping[str, str]) -> str:
     """A page's text with its style, and with contents in place of their marks."""
-    style = read("style.css", VIEWER) + read("play.css")
-    for mark, content in {"/*STYLE*/": style, **contents}.items():
-        before, after = text.split(mark)
-        text = before + content + after
-    return text
+    return fill_page(text, {"/*STYLE*/": read_asset("style.css") + read_asset("play.css", FILES), **contents})
 
 
 def scripts(own: Iterable[str]) -> str:
     """The viewer's scripts for drawing, then some of this package's."""
-    return "\n".join([*(read(name, VIEWER) for name in VIEWER_SCRIPTS), *map(read, own)])
+    return "\n".join([*map(read_asset, VIEWER_SCRIPTS), *(read_asset(name, FILES) for name in own)])
 
 
 def policy() -> str:
@@ -37,8 +34,3 @@ def policy() -> str:
     rules = ("default-src 'none'", "script-src 'unsafe-inline'", "style-src 'unsafe-inline'", "img-src data:")
     closed = ("base-uri 'none'", "form-action 'none'", "frame-ancestors 'none'")
     return "; ".join((*rules, "connect-src 'self'", *closed))
-
-
-def read(name: str, package: str = f"{__package__}.page_files") -> str:
-    """The text of a file of a package, of this one's page when left out."""
-    return files(package).joinpath(name).read_text(encoding="utf-8")

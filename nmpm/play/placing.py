@@ -1,8 +1,10 @@
-"""Where new particles go: on a lattice, where there is room."""
+"""Where new particles go: blocks on a lattice, jets row by row, and both only where there is room."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,6 +16,10 @@ from nmpm.scene import Scene
 
 _CLEARANCE = 0.75
 """Least distance of a new particle from others, in spacings."""
+_ROWS = 2
+"""Of particles that are poured at once: each time costs a call."""
+_SLOWEST = 0.5
+"""A slow jet flows as if by this share of a particle's spacing in a frame."""
 
 
 def block(at: Sequence[float], sides: Sequence[float], spacing: float) -> Tensor:
@@ -48,3 +54,42 @@ def with_room(points: Tensor, scene: Scene, others: Iterable[Tensor], bodies: It
             apart, _ = cKDTree(finite).query(points.numpy(), distance_upper_bound=clearance)
             free &= torch.from_numpy(np.isinf(apart))
     return points[free]
+
+
+class Pour(NamedTuple):
+    """A material that is poured at a point (D,) with a velocity (D,), in domain length and seconds."""
+
+    material: int
+    at: Sequence[float]
+    velocity: Sequence[float]
+    width: float
+
+
+class Jet:
+    """Rows of particles, one behind the other, as fast as what is poured now, `pour`, flows; None for nothing.
+
+    Args:
+        spacing: Between particles, in domain length.
+        dt: Time between frames, in seconds.
+    """
+
+    def __init__(self, spacing: float, dt: float) -> None:
+        self._spacing, self._dt, self._flown = spacing, dt, 0.0
+        self.pour: Pour | None = None
+
+    def turn(self, pour: Pour | None) -> None:
+        """Pour, elsewhere, or no longer; the first rows come at once."""
+        if pour is None or self.pour is None:
+            self._flown = math.inf
+        self.pour = pour
+
+    def rows(self, pour: Pour) -> Tensor | None:
+        """(N, D) particles for the next frame; None until the last ones have made room."""
+        speed = math.hypot(*pour.velocity)
+        self._flown += max(speed * self._dt, _SLOWEST * self._spacing)
+        if self._flown < _ROWS * self._spacing:
+            return None
+        self._flown = 0.0
+        steps = [number * self._spacing / speed for number in range(_ROWS)]
+        centres = [[x + step * v for x, v in zip(pour.at, pour.velocity, strict=True)] for step in steps]
+        return torch.cat([row(centre, pour.velocity, pour.width, self._spacing) for centre in centres])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,22 +21,11 @@ MOST_BYTES = 2**27
 _FEWEST = 3
 
 
-class PlayedFrame(NamedTuple):
-    """A frame: positions (N, D), and the bodies by id."""
-
-    position: Tensor
-    bodies: Mapping[int, Body]
-
-    @property
-    def bytes(self) -> int:
-        return self.position.numel() * self.position.element_size()
-
-
 class Recording:
-    """The last frames that were played."""
+    """The last frames that were played: positions (N, D), and the bodies by id."""
 
     def __init__(self) -> None:
-        self._frames: deque[PlayedFrame] = deque()
+        self._frames: deque[tuple[Tensor, Mapping[int, Body]]] = deque()
         self._bytes, self.forgotten = 0, 0
 
     def __len__(self) -> int:
@@ -45,10 +33,10 @@ class Recording:
 
     def add(self, position: Tensor, bodies: Mapping[int, Body]) -> None:
         """Keep a frame, positions (N, D) of which there are never fewer, and bodies by id."""
-        self._frames.append(PlayedFrame(position.float().cpu(), dict(bodies)))
-        self._bytes += self._frames[-1].bytes
+        self._frames.append((position.float().cpu(), dict(bodies)))
+        self._bytes += self._frames[-1][0].nbytes
         while self._bytes > MOST_BYTES and len(self._frames) > _FEWEST:
-            self._bytes -= self._frames.popleft().bytes
+            self._bytes -= self._frames.popleft()[0].nbytes
             self.forgotten += 1
 
     def trajectory(self, scene: Scene, material: Tensor, gravity: Tensor, static: Tensor, model: str) -> Trajectory:
@@ -68,8 +56,8 @@ class Recording:
             raise DataError("nothing was played yet: let it run for some frames first")
         count, dim = len(material), static.shape[-1]
         path = torch.full((len(self._frames), count, dim), torch.nan)
-        for row, frame in zip(path, self._frames, strict=True):
-            row[: len(frame.position)] = frame.position
+        for row, (position, _) in zip(path, self._frames, strict=True):
+            row[: len(position)] = position
         obstacles = self._obstacle_frames(scene, static)
         moves = bool((obstacles != obstacles[:1]).any())
         state = Particles(
@@ -88,10 +76,10 @@ class Recording:
     def _obstacle_frames(self, scene: Scene, static: Tensor) -> Tensor:
         """(T, M, D) particles that fill the bodies, NaN where one is not there, after those that stay."""
         length, columns = len(self._frames), [static.float().cpu().expand(len(self._frames), -1, -1)]
-        for number in sorted({number for frame in self._frames for number in frame.bodies}):
+        for number in sorted({number for _, bodies in self._frames for number in bodies}):
             filled: dict[int, Tensor] = {}  # by the body, which is the same object in frames between moves
             rows = []
-            for body in (frame.bodies.get(number) for frame in self._frames):
+            for body in (bodies.get(number) for _, bodies in self._frames):
                 if body is not None and id(body) not in filled:
                     filled[id(body)] = body.particles(scene.particle_spacing).float()
                 rows.append(None if body is None else filled[id(body)])

@@ -13,9 +13,8 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from nmpm.play.messages import MOST_BYTES
 from nmpm.play.page import page, policy
-from nmpm.play.session import Session
+from nmpm.play.session import MOST_BYTES, Session
 
 HOST = "127.0.0.1"
 TICK = 1 / 60
@@ -41,6 +40,7 @@ class PlayServer:
         self.session, self.port, self.token = session, port, secrets.token_urlsafe(16)
         self.listening_at: list[tuple[str, int]] = []
         self._page: ServerConnection | None = None
+        self._opening = asyncio.Lock()
         self._inbox: asyncio.Queue[str | bytes] = asyncio.Queue(_WAITING)
 
     @property
@@ -79,10 +79,11 @@ class PlayServer:
 
     async def _connect(self, page: ServerConnection) -> None:
         """Read what a page sends until it is closed."""
-        if self._page is not None:
-            await self._page.close(_TAKEN_OVER, "the scene is played in another window")
-        await self._send(page, self.session.greet())
-        self._page = page
+        async with self._opening:  # one after the other: each closes the one before
+            if self._page is not None:
+                await self._page.close(_TAKEN_OVER, "the scene is played in another window")
+            await self._send(page, self.session.greet())
+            self._page = page
         with suppress(ConnectionClosed):
             async for message in page:
                 await self._inbox.put(message)

@@ -1,43 +1,49 @@
 """A session: applies what a player does to a scene, and answers with messages for the page.
 
 It knows nothing of networks. The server passes on what comes in by `receive`, and sends what `tick` gives 60 times a
-second.
+second. A message of the page is a JSON object: `do` is the name of one of `COMMANDS`, methods of a session, and the
+other keys are its arguments. They are in domain length, seconds and radians; (D,) where they are points or vectors.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import make_dataclass
+from functools import cache
+from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_type_hints
 
 import torch
 
-from nmpm._support.messages import one_line
-from nmpm.data.described import described_metadata
+from nmpm._support.messages import one_line, suggestion
+from nmpm._support.plain_data import from_plain
+from nmpm.data.predictions import read_description
 from nmpm.data.write import write_trajectory
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.obstacles import Disc, Ramp
 from nmpm.play import pictures
 from nmpm.play.beside import SimulatorBeside
-from nmpm.play.commands import Pour, Throw
 from nmpm.play.limits import Limits
-from nmpm.play.messages import read_command
-from nmpm.play.placing import block, with_room
-from nmpm.play.pouring import Jet
+from nmpm.play.placing import Jet, Pour, block, with_room
 from nmpm.play.pushing import ANGLE, Movable, moved, new_body, push
 from nmpm.play.recording import Recording, free_name
-from nmpm.play.start import simulator_of, start_of
-from nmpm.play.world import World
+from nmpm.play.world import World, first_frame, simulator_of
 from nmpm.zoo.states import StateBuilder
 
 if TYPE_CHECKING:
     from nmpm.zoo import Pretrained
 
+T = TypeVar("T")
 Message = str | bytes
+Vector = tuple[float, ...]
 
+MOST_BYTES = 1000
+"""Longest message of a page."""
 MOST_BODIES = 12
 AHEAD = 4
 """Pictures that may be on their way: a page that draws fewer than 60 a second, or is hidden, slows the session."""
@@ -66,7 +72,8 @@ class Session:
     def receive(self, text: Message) -> None:
         """Do what a message says; whatever is wrong with it is answered by a message, and changes nothing."""
         try:
-            read_command(text).apply(self)
+            name, values = _read_command(text)
+            COMMANDS[name](self, **values)
         except NmpmError as error:
             self.say(one_line(error, 300))
 
@@ -106,8 +113,7 @@ class Session:
                 self._changed = True
             if self._changed:
                 self._show()
-            if self._beside is not None:
-                self._outbox += self._simulated()
+            self._show_simulated()
         if self._ticks % _STATUS_TICKS == 0:
             self._outbox.append(self._status())
         return self._sent()
@@ -117,66 +123,86 @@ class Session:
         self.set_beside(False)
         self._thread.shutdown()
 
-    # What a player can do; see `nmpm.play.commands`.
+    # What a player can do, see `COMMANDS`; raises an NmpmError, and changes nothing, where it cannot be done.
 
-    def throw(self, throw: Throw) -> None:
-        self.limits.check_throw(throw)
-        points = block(throw.at, throw.sides, self.scene.particle_spacing)
-        if not self._add(points, throw.velocity, throw.material):
+    def throw(self, material: int, at: Vector, sides: Vector, velocity: Vector) -> None:
+        """Put a block of a material around a point, with a velocity."""
+        self.limits.check_throw(material, at, sides, velocity)
+        if not self._add(block(at, sides, self.scene.particle_spacing), velocity, material):
             raise ConfigError("there is no room for a block here")
 
-    def pour(self, pour: Pour | None) -> None:
-        if pour is not None:
-            self.limits.check_pour(pour)
+    def pour(self, material: int, at: Vector, velocity: Vector, width: float) -> None:
+        """Pour a material at a point until it is stopped; again, to move the point."""
+        pour = Pour(material, at, velocity, width)
+        self.limits.check_pour(pour)
         self._jet.turn(pour)
 
-    def move(self, number: int, centre: Sequence[float], angle: float) -> None:
-        before = self._body(number)
+    def stop(self) -> None:
+        """Stop pouring."""
+        self._jet.turn(None)
+
+    def move(self, body: int, centre: Vector, angle: float) -> None:
+        """Move a body, which pushes particles out of its way."""
+        before = self._body(body)
         self.limits.check_vector("centre", centre)
-        body = moved(before, tuple(centre), math.remainder(angle, 2 * math.pi))
-        self.world.set_bodies({**self.world.bodies, number: body})
+        after = moved(before, centre, math.remainder(angle, 2 * math.pi))
+        self.world.set_bodies({**self.world.bodies, body: after})
         state = self.world.now()
         margin, limit = 0.5 * self.scene.particle_spacing, self.limits.fastest.amin(dim=0) * self.scene.dt
-        position, velocity = push(body, state.position[0], state.velocity[0], margin, limit)
+        position, velocity = push(after, state.position[0], state.velocity[0], margin, limit)
         low, high = position.new_tensor(self.scene.bounds).T
         self.world.set_motion(position.clamp(low, high)[None], velocity[None])
         self._bodies_changed()
 
-    def put(self, kind: Literal["ramp", "disc"], centre: Sequence[float]) -> None:
+    def put(self, kind: Literal["ramp", "disc"], centre: Vector) -> None:
+        """Put another body into the scene."""
         self.limits.check_vector("centre", centre)
         if self.scene.dim != 2:
             raise ConfigError("bodies can be put into scenes in two dimensions alone")
         if len(self.world.bodies) >= MOST_BODIES:
             raise ConfigError(f"there are {MOST_BODIES} bodies already: take one away first")
         number = 1 + max(self.world.bodies, default=-1)
-        self.world.set_bodies({**self.world.bodies, number: new_body(kind, tuple(centre), self.model.emulator)})
+        self.world.set_bodies({**self.world.bodies, number: new_body(kind, centre, self.model.emulator)})
         self.move(number, centre, ANGLE)
 
-    def remove(self, number: int) -> None:
-        self._body(number)
-        self.world.set_bodies({key: body for key, body in self.world.bodies.items() if key != number})
+    def remove(self, body: int) -> None:
+        """Take a body away."""
+        self._body(body)
+        self.world.set_bodies({key: other for key, other in self.world.bodies.items() if key != body})
         self._bodies_changed()
 
-    def set_gravity(self, vector: Sequence[float]) -> None:
+    def set_gravity(self, vector: Vector) -> None:
+        """Turn gravity, in length per second squared."""
         self.limits.check_vector("gravity", vector)
         builder = StateBuilder(self.model.emulator, self.world.now().position, torch.float32)
         self.world.set_gravity(builder.gravity(vector))
         self._scene_changed()
 
+    def set_playing(self, on: bool) -> None:
+        """Play, or pause."""
+        self.playing = on
+
     def step(self) -> None:
+        """Go on by one frame, and pause."""
         self.playing = False
         self._advance()
         self._changed = True
 
+    def set_pace(self, frames: Literal[1, 2, 4]) -> None:
+        """So many frames of the model for each picture."""
+        self.pace = frames
+
     def restart(self, seed: int) -> None:
+        """Start from the scene of a seed."""
         self.limits.check_seed(seed)
-        self.world = World(self.model.emulator, start_of(self.model, seed), self._thread)
+        self.world = World(self.model.emulator, *first_frame(self.model, seed), self._thread)
         self.seed, self.frame, self.recording = seed, 0, Recording()
         self._jet = Jet(self.scene.particle_spacing, self.scene.dt)
         self._show_all()
         self._scene_changed()
 
     def set_beside(self, on: bool) -> None:
+        """Run the simulator beside the emulator from its present state, or end that."""
         if self._beside is not None:
             self._beside.close()
         self._beside = None
@@ -188,14 +214,16 @@ class Session:
             self._beside = beside
 
     def save(self) -> None:
+        """Write what was played since the last restart."""
         model, world = f"the model {self.model.name}, played with", self.world
         made = self.recording.trajectory(self.scene, world.material, world.now().gravity, world.static, model)
         path = free_name(self.out)
-        write_trajectory(path, made, described_metadata(made.attributes, path, len(made.position)))
+        write_trajectory(path, made, read_description(made.attributes, path, len(made.position))[1])
         lost = f", without the first {self.recording.forgotten}" if self.recording.forgotten else ""
         self.say(f"wrote {len(made.position)} frames{lost} to {path}: nmpm view {path}", "news")
 
     def see(self, picture: int) -> None:
+        """The page has drawn a picture, by its number."""
         if not self._seen <= picture <= self._picture:
             raise ConfigError(f"picture = {one_line(picture, 30)} was not sent")
         self._seen = picture
@@ -248,16 +276,16 @@ class Session:
     def _scene_changed(self) -> None:
         """Show the scene in the next picture, and let the simulator beside start from it."""
         self._changed = True
-        if self._beside is not None:
-            self._try_beside()
+        self._ask_beside(lambda beside: beside.start(self.world, self.frame))
 
-    def _try_beside(self) -> None:
+    def _ask_beside(self, call: Callable[[SimulatorBeside], T]) -> T | None:
+        """What the simulator beside answers; None without one, and where it fails, which the page is told."""
         try:
-            if self._beside is not None:
-                self._beside.start(self.world, self.frame)
+            return None if self._beside is None else call(self._beside)
         except NmpmError as error:
             self.set_beside(False)
             self.say(one_line(error, 300))
+            return None
 
     def _show_all(self) -> None:
         self._outbox.append(json.dumps({"seed": self.seed, "gravity": self.world.gravity}))
@@ -271,18 +299,12 @@ class Session:
         position = self.world.position.numpy()
         self._outbox.append(pictures.picture(self.scene, pictures.EMULATOR, self._picture, self.frame, position))
 
-    def _simulated(self) -> Iterator[Message]:
+    def _show_simulated(self) -> None:
         """The picture of the simulator beside, as far as it has come."""
-        beside = self._beside
-        try:
-            frames = self.pace if self.playing else 0
-            shown = beside.advance(self.world, self.frame, frames) if beside is not None else None
-        except NmpmError as error:
-            self.set_beside(False)
-            self.say(one_line(error, 300))
-            return
+        frames = self.pace if self.playing else 0
+        shown = self._ask_beside(lambda beside: beside.advance(self.world, self.frame, frames))
         if shown is not None:
-            yield pictures.picture(self.scene, pictures.SIMULATOR, self._picture, *shown)
+            self._outbox.append(pictures.picture(self.scene, pictures.SIMULATOR, self._picture, *shown))
 
     def _status(self) -> str:
         status = {
@@ -297,3 +319,47 @@ class Session:
     def _sent(self) -> list[Message]:
         sent, self._outbox = self._outbox, []
         return sent
+
+
+COMMANDS: Mapping[str, Callable[..., None]] = MappingProxyType(
+    {
+        "throw": Session.throw,
+        "pour": Session.pour,
+        "stop": Session.stop,
+        "move": Session.move,
+        "put": Session.put,
+        "remove": Session.remove,
+        "gravity": Session.set_gravity,
+        "play": Session.set_playing,
+        "step": Session.step,
+        "pace": Session.set_pace,
+        "restart": Session.restart,
+        "beside": Session.set_beside,
+        "save": Session.save,
+        "seen": Session.see,
+    }
+)
+"""What a player can do, by the value of `do`."""
+
+
+def _read_command(message: Message) -> tuple[str, dict[str, Any]]:
+    """The name and the arguments of a message's command; ConfigError if there is none, or they are not its own."""
+    if len(message) > MOST_BYTES:
+        raise ConfigError(f"the message has {len(message)} characters; at most {MOST_BYTES} are read")
+    try:
+        plain = json.loads(message)
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"the message is no JSON: {one_line(error, 80)}") from error
+    if not isinstance(plain, dict) or not isinstance(plain.get("do"), str):
+        raise ConfigError('the message has no "do"')
+    name = plain.pop("do")
+    if name not in COMMANDS:
+        raise ConfigError(f"there is no {one_line(repr(name), 40)}.{suggestion(name[:40], COMMANDS)}")
+    return name, dict(vars(from_plain(_arguments(COMMANDS[name]), plain, name)))
+
+
+@cache
+def _arguments(command: Callable[..., None]) -> type:
+    """The arguments of a command as a dataclass, by which values are checked."""
+    hints = get_type_hints(command)
+    return make_dataclass("Arguments", [(name, hints[name]) for name in list(signature(command).parameters)[1:]])

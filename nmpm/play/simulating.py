@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from typing import NamedTuple
 
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 
 from nmpm.errors import NmpmError
 from nmpm.sim import InitialState, Preset
-from nmpm.sim.state import Array
 
 
 class Simulated(NamedTuple):
@@ -50,12 +48,8 @@ def _run(pipe: Connection, run: int, preset: Preset, start: InitialState) -> Non
     while not pipe.poll():
         number, started = number + 1, time.perf_counter()
         try:
-            position = _next(frames)
+            position = next(frames).astype(np.float32)
         except NmpmError as error:
             pipe.send(Simulated(run, number, none, 0.0, str(error)))
             return
         pipe.send(Simulated(run, number, position, time.perf_counter() - started))
-
-
-def _next(frames: Iterator[Array]) -> NDArray[np.float32]:
-    return next(frames).astype(np.float32)

@@ -10,9 +10,9 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -23,9 +23,14 @@ from nmpm.emulator.bundle import Bundle
 from nmpm.emulator.prescribed import without_escaped
 from nmpm.emulator.rollouts import unroll
 from nmpm.errors import ConfigError
-from nmpm.obstacles import Body
+from nmpm.obstacles import Body, Ramp
 from nmpm.particles import Particles
-from nmpm.play.start import Start
+from nmpm.sim import Preset, SimulatedRamp
+from nmpm.sim.mpm.mixture import MpmMixture
+from nmpm.zoo.scenes import training_preset
+
+if TYPE_CHECKING:
+    from nmpm.zoo import Pretrained
 
 ROW = 512
 """The number of particles is padded to multiples of it, so that shapes repeat."""
@@ -38,7 +43,8 @@ class World:
 
     Args:
         emulator: What predicts it.
-        start: Its first frame.
+        particles: Its first frame (B = 1), with the obstacles that stay where they are.
+        bodies: Further obstacles, which may be moved.
         thread: One thread, in which it predicts.
 
     Attributes:
@@ -47,13 +53,13 @@ class World:
         static: (1, M, D) obstacles that stay, in domain length.
     """
 
-    def __init__(self, emulator: Emulator, start: Start, thread: Executor) -> None:
-        self.emulator, self.static, self._thread = emulator, start.particles.obstacle, thread
-        self.bodies: dict[int, Body] = dict(enumerate(start.bodies))
-        self.count = start.particles.position.shape[1]
+    def __init__(self, emulator: Emulator, particles: Particles, bodies: Sequence[Body], thread: Executor) -> None:
+        self.emulator, self.static, self._thread = emulator, particles.obstacle, thread
+        self.bodies: dict[int, Body] = dict(enumerate(bodies))
+        self.count = particles.position.shape[1]
         self._times: deque[float] = deque(maxlen=_TIMED_CALLS)
         self._samples: dict[int, tuple[Body, Tensor, Tensor]] = {}
-        self._restart(self._among(start.particles, self.bodies))
+        self._restart(self._among(particles, self.bodies))
 
     @property
     def position(self) -> Tensor:
@@ -101,16 +107,11 @@ class World:
         state, more, first = self.now(), len(position), self.count
         state = _padded(state, -(-(first + more) // ROW) * ROW)
         slots = slice(first, first + more)
-        values: dict[str, Tensor | float] = {
-            "position": position,
-            "velocity": velocity,
-            "material": material,
-            "mask": True,
-        }
-        changed: dict[str, Any] = {name: _with(getattr(state, name), slots, value) for name, value in values.items()}
+        new: dict[str, Any] = {"position": position, "velocity": velocity, "material": material, "mask": True}
         if state.volume is not None:
-            changed["volume"] = _with(state.volume, slots, 1.0)
-        fields = {name: _with_mean(v, slots, state.mask) for name, v in state.fields.items() if v.shape[1] > 1}
+            new["volume"] = 1.0
+        changed: dict[str, Any] = {name: _with(getattr(state, name), slots, value) for name, value in new.items()}
+        fields = {name: _with(v, slots, v[state.mask].mean()) for name, v in state.fields.items() if v.shape[1] > 1}
         self.count += more
         self._restart(dataclasses.replace(state, **changed).with_fields(fields))
 
@@ -201,6 +202,18 @@ def _with(values: Tensor, slots: slice, new: Tensor | float) -> Tensor:
     return values
 
 
-def _with_mean(values: Tensor, slots: slice, mask: Tensor) -> Tensor:
-    """A field (1, N) with the mean over the particles that are there for the new ones."""
-    return _with(values, slots, values[mask].mean())
+def simulator_of(model: Pretrained) -> Preset | None:
+    """The preset that simulates a model's scenes from any state; None where there is none."""
+    preset = training_preset(model)
+    return None if isinstance(preset, MpmMixture) else preset
+
+
+def first_frame(model: Pretrained, seed: int) -> tuple[Particles, tuple[Body, ...]]:
+    """The scene of a seed, as `Pretrained.example` gives it, and its ramps, if all its obstacles are, as bodies."""
+    state, preset = model.example(seed).to(model.emulator.device), simulator_of(model)
+    obstacles = () if preset is None else preset.draw(seed).obstacles
+    ramps = [ramp for ramp in obstacles if isinstance(ramp, SimulatedRamp) and len(ramp.centre) == 2]
+    if not ramps or len(ramps) < len(obstacles):
+        return state, ()
+    bodies = tuple(Ramp(ramp.centre, ramp.length, ramp.thickness, ramp.angle) for ramp in ramps)
+    return dataclasses.replace(state, obstacle=state.obstacle[:, :0], obstacle_mask=state.obstacle_mask[:, :0]), bodies

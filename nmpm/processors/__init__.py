@@ -7,11 +7,8 @@ from nmpm.processors.axial import Axial
 from nmpm.processors.base import ChannelLayers, GridLayout, GridProcessor, Processor
 from nmpm.processors.baselines import Identity, Pointwise
 from nmpm.processors.fourier import FFNO, FNO, TFNO
-from nmpm.processors.patched import Patched
-from nmpm.processors.stochastic import Stochastic
-from nmpm.processors.turned import Turned
-from nmpm.processors.unet import UNet
-from nmpm.processors.ushape import ConvNeXt, UNetModern
+from nmpm.processors.unet import ConvNeXt, UNet, UNetModern
+from nmpm.processors.wrappers import Patched, Stochastic, Turned
 
 __all__ = [
     "FFNO",

@@ -26,7 +26,7 @@ from nmpm.processors.convolution import (
     pad_to_multiple,
     return_patches,
 )
-from nmpm.processors.ushape import ChannelNorm
+from nmpm.processors.unet import ChannelNorm
 
 _SLOWEST = 100.0  # patches in which the slowest rotary angle turns by one radian
 

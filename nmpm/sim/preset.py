@@ -6,6 +6,7 @@ import abc
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any, ClassVar, Self
@@ -14,12 +15,10 @@ import numpy as np
 
 from nmpm._support.bounded_files import FILE_NAME
 from nmpm._support.messages import one_line
-from nmpm._support.numbers import check_whole
-from nmpm._support.plain_data import from_plain, to_plain
+from nmpm._support.plain_data import check_whole, from_plain, to_plain
 from nmpm.errors import ConfigError
 from nmpm.scene import Interval, Scene
-from nmpm.sim.blocks import Layout
-from nmpm.sim.state import Array, InitialState, Obstacle, Progress, SimulatedTrajectory, check, check_numbers
+from nmpm.sim.state import Array, InitialState, Layout, Obstacle, Progress, SimulatedTrajectory, check, check_numbers
 
 BOUNDARY = 3
 """Type id of particles that never move, as in DeepMind's scenes."""
@@ -243,3 +242,31 @@ class Preset(abc.ABC):
             ConfigError: if a key is unknown, missing or of the wrong kind.
         """
         return from_plain(cls, plain, "the preset")
+
+
+def twin_of(preset: Preset) -> Preset:
+    """The twin: the simulator with half as many substeps; with the fewest that the solver accepts if that is more.
+
+    Where it accepts no fewer, with twice as many. The distance of the two estimates the simulator's own error.
+    """
+    for substeps in (-(-preset.substeps // 2), preset.stable_substeps):
+        if substeps < preset.substeps:
+            with suppress(ConfigError):
+                return dataclasses.replace(preset, substeps=substeps)
+    return dataclasses.replace(preset, substeps=2 * preset.substeps)
+
+
+def nudge(preset: Preset, start: InitialState, share: float, seed: int) -> InitialState:
+    """The state with Gaussian noise on its positions, which stay within the box.
+
+    Args:
+        preset: Gives domain and box.
+        start: Of the preset.
+        share: Standard deviation of the noise, as a share of the domain's longest side.
+        seed: Of the noise.
+    """
+    side = max(high - low for low, high in preset.domain)
+    noise = share * side * np.random.default_rng(seed).standard_normal(start.position.shape)
+    low, high = np.array(preset.box).T
+    low, high = np.minimum(low, start.position.min(0)), np.maximum(high, start.position.max(0))
+    return dataclasses.replace(start, position=np.clip(start.position + noise, low, high))

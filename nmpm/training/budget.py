@@ -8,7 +8,6 @@ from lightning.pytorch import Trainer
 from lightning.pytorch.callbacks import Timer
 from lightning.pytorch.callbacks.timer import Interval
 
-from nmpm._support.collectives import broadcast_from_rank0
 from nmpm.errors import ConfigError
 
 CLOCK_EVERY = 16
@@ -41,7 +40,7 @@ class Clock:
         timers = _timers(trainer)
         if timers and (trainer.world_size == 1 or step % CLOCK_EVERY == 0):
             elapsed = max(timer.time_elapsed() / (timer._duration or 1.0) for timer in timers)
-            self._share = broadcast_from_rank0(min(elapsed, 1.0), trainer.strategy.root_device)
+            self._share = trainer.strategy.broadcast(min(elapsed, 1.0))
         return self._share
 
 

@@ -33,13 +33,12 @@ from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 from torchmetrics import Metric
 
-from nmpm._support.devices import computes_bfloat16
-from nmpm._support.memory import free_memory
+from nmpm._support.machine import computes_bfloat16, free_memory
 from nmpm._support.messages import one_line, suggestion
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.grid_rule import MULTIPLE, TrainingSize, grid_shape
-from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.recording import SplitRecordings
+from nmpm.data.recordings import SplitRecordings
+from nmpm.data.windows import collate
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.comparison import Comparison, still
 from nmpm.processors import GridProcessor, UNet

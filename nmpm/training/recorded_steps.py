@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from nmpm._support.devices import copy_to
+from nmpm._support.machine import copy_to
 from nmpm.emulator import Emulator
 from nmpm.emulator.engines import graphs
 from nmpm.emulator.engines.engine import is_autocast

@@ -13,7 +13,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import imageio.v2 as imageio
 import matplotlib as mpl
 import numpy as np
 from numpy.typing import NDArray
@@ -254,6 +253,8 @@ def _write_gif(renderer: FrameRenderer, frames: list[int], fps: float, path: Pat
 
 
 def _write_mp4(renderer: FrameRenderer, frames: list[int], fps: float, path: Path) -> None:
+    import imageio.v2 as imageio  # of the extra video, as its encoder is
+
     encoder: Any = imageio.get_writer(
         path, format="FFMPEG", mode="I", fps=fps, codec="libx264", quality=8, macro_block_size=2
     )

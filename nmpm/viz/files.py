@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nmpm.data.convert import Options
-from nmpm.data.described import read_description
 from nmpm.data.fields import read_fields
 from nmpm.data.format import MEMBER, TRUTH, Metadata, Split, Trajectory, read_metadata
 from nmpm.data.gravity import trajectory_gravity
+from nmpm.data.predictions import read_description
 from nmpm.data.scene_inference import infer_scene
 from nmpm.errors import DataError
 from nmpm.scene import Scene
@@ -41,10 +41,11 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
     if not 0 <= index < len(split):
         raise DataError(f"{split.path} contains trajectories 0 … {len(split) - 1}, not {index}.")
     trajectory = split.read(index)
-    scene, names, static, prescribed, source = _describe(split, trajectory, family)
+    scene, metadata, source = _describe(split, trajectory, family)
+    names = metadata.particle_types
     others = _read_further_members(split, index, trajectory)
     label = f"member {trajectory.attributes[MEMBER]}" if others else source
-    moving = ~np.isin(trajectory.particle_type, sorted(static))
+    moving = ~metadata.is_static(trajectory.particle_type)
     fields = read_fields(split, index, scene.particle_fields)
     position = trajectory.position
     positions = {label: position}
@@ -68,7 +69,7 @@ def read_labelled(split: Split, index: int = 0, family: str | None = None) -> La
         gravity=trajectory_gravity(trajectory.attributes, scene, f"{split.path}, trajectory {index}"),
         title=_title(split, index, material_names(trajectory.particle_type[moving], names), len(others)),
         fields={name: {label: values[:frames, moving]} for name, values in fields.items() if values.shape[1] > 1},
-        prescribed=frozenset(names[number] for number in prescribed),
+        prescribed=frozenset(names[number] for number in metadata.prescribed_types),
         further_members={name: position[:frames, moving] for name, position in others.items()},
         densities=dict(zip(scene.materials, scene.densities, strict=False)),
     )
@@ -190,20 +191,12 @@ def combine(
     )
 
 
-def _describe(
-    split: Split, trajectory: Trajectory, family: str | None
-) -> tuple[Scene, dict[int, str], frozenset[int], frozenset[int], str]:
-    """Scene, names of type ids, ids that do not move and those that move as prescribed, and label.
-
-    From metadata.json or a prediction's attributes.
-
-    `nmpm.data.predictions` and `nmpm.data.described` store these attributes.
-    """
-    attributes, path = trajectory.attributes, split.path
-    if "scene" not in attributes:
-        metadata = read_metadata(path.parent, family)
-        label = "simulated" if str(metadata.extra.get("generator", "")).startswith("nmpm") else "recorded"
-        scene, names = infer_scene(path.parent, Options(family)), dict(metadata.particle_types)
-        return scene, names, metadata.static_types, metadata.prescribed_types, label
-    label = "prediction" if "predicted by" in str(attributes.get("generator")) else "recorded"
-    return *read_description(attributes, path), label
+def _describe(split: Split, trajectory: Trajectory, family: str | None) -> tuple[Scene, Metadata, str]:
+    """Scene and metadata, of a prediction's attributes or else of metadata.json, and label."""
+    attributes = trajectory.attributes
+    if "scene" in attributes:
+        predicted = "predicted by" in str(attributes.get("generator"))
+        return *read_description(attributes, split.path, split.frames(0)), "prediction" if predicted else "recorded"
+    metadata, scene = read_metadata(split.path.parent, family), infer_scene(split.path.parent, Options(family))
+    simulated = str(metadata.extra.get("generator", "")).startswith("nmpm")
+    return scene, metadata, "simulated" if simulated else "recorded"

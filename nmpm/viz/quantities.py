@@ -81,9 +81,8 @@ def front(trajectories: LabelledTrajectories, position: Floats) -> Curve:
     there = ~np.isnan(position[..., 0])
     start = int(there.any(axis=1).argmax())
     offset = position - position[start, there[start]].astype(np.float64).mean(axis=0)
-    for axis, period in enumerate(trajectories.periods):
-        if period:
-            offset[..., axis] -= period * np.round(offset[..., axis] / period)
+    for axis in range(trajectories.dim):
+        offset[..., axis] = trajectories.shortest(offset[..., axis], axis)
     offset -= (offset @ down)[..., None] * down
     distance = np.sort(np.sqrt(np.square(offset).sum(axis=-1)), axis=1)  # (NaN comes last)
     index = np.maximum(np.ceil(FRONT * there.sum(axis=1) - 1e-9).astype(int) - 1, 0)
@@ -97,9 +96,9 @@ def kinetic_energy(trajectories: LabelledTrajectories, position: Floats) -> Curv
     """
     moving = trajectories.predicted
     squares = np.zeros((max(len(position) - 1, 0), int(moving.sum())))
-    for axis, period in enumerate(trajectories.periods):
+    for axis in range(trajectories.dim):
         step = np.diff(position[:, moving, axis].astype(np.float64), axis=0)
-        squares += np.square(step - period * np.round(step / period) if period else step)
+        squares += np.square(trajectories.shortest(step, axis))
     mass = np.array([trajectories.densities.get(name, 1.0) for name in trajectories.material[moving].tolist()])
     energy = _mean(squares, mass) / (2 * trajectories.dt**2)
     return np.concatenate([energy[:1] if len(energy) else np.zeros(1), energy])

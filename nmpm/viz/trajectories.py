@@ -189,10 +189,9 @@ class LabelledTrajectories:
     def rms_distance(self, first: Floats, second: Floats) -> NDArray[np.float64]:
         """Root mean square distance (T,) of the predicted particles of two trajectories (T, N, D), as `rms_errors`."""
         squares = np.zeros(len(first))
-        for axis, period in enumerate(self.periods):
-            difference = second[:, self.predicted, axis].astype(np.float64) - first[:, self.predicted, axis]
-            if period:
-                difference -= period * np.round(difference / period)
+        for axis in range(self.dim):
+            apart = second[:, self.predicted, axis].astype(np.float64) - first[:, self.predicted, axis]
+            difference = self.shortest(apart, axis)
             there = ~np.isnan(difference)
             squares += np.square(np.where(there, difference, 0.0)).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
         return np.sqrt(squares)
@@ -211,6 +210,11 @@ class LabelledTrajectories:
             return position
         low, high = np.array(self.bounds).T
         return np.where(self.periodic, low + np.mod(position - low, high - low), position)
+
+    def shortest(self, difference: Floats, axis: int) -> Floats:
+        """Differences of positions along an axis, the shortest ones where it is periodic."""
+        period = self.periods[axis]
+        return difference - period * np.round(difference / period) if period else difference
 
     def _check_positions(self) -> None:
         if not self.positions:

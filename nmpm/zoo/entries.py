@@ -22,8 +22,7 @@ from nmpm._support.messages import one_line
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.errors import ConfigError, DataError, NmpmError, ZooError
 from nmpm.processors import GridLayout
-from nmpm.zoo.card import CARD
-from nmpm.zoo.entry_files import BEST, CONFIG, WEIGHT_BYTES, WEIGHTS, read_card
+from nmpm.zoo.card import BEST, CARD, CONFIG, WEIGHT_BYTES, WEIGHTS, read_card
 from nmpm.zoo.pretrained import Pretrained
 
 if TYPE_CHECKING:

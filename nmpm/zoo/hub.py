@@ -21,8 +21,7 @@ from nmpm._support.atomic import atomic_folder
 from nmpm._support.bounded_files import read_bounded, read_yaml, to_yaml
 from nmpm._support.messages import one_line
 from nmpm.errors import DataError, ZooError
-from nmpm.zoo.card import CARD, SIMULATED
-from nmpm.zoo.entry_files import FILES, WEIGHT_BYTES, WEIGHTS
+from nmpm.zoo.card import CARD, FILES, SIMULATED, WEIGHT_BYTES, WEIGHTS
 
 REPOSITORY = r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}"
 REVISION = r"[\w./-]{1,100}"

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from nmpm.data.dataset import Dataset, load_trajectories
-from nmpm.data.loading.sources import FolderSource
-from nmpm.data.motion import measure_motion
+from nmpm.data.sources import FolderSource
+from nmpm.data.survey import measure_motion
 from nmpm.emulator.similarity import Match, find_match
 from nmpm.errors import ConfigError
 from nmpm.scene import Motion, Scene

@@ -25,9 +25,8 @@ from nmpm.evaluation.figures import (
     figures_unit,
     with_unit,
 )
-from nmpm.zoo.card import FACTOR, fastest_time, lifecycle, stated_milliseconds, trivial_error
+from nmpm.zoo.card import CONFIG, FACTOR, fastest_time, lifecycle, read_card, stated_milliseconds, trivial_error
 from nmpm.zoo.entries import read_recipe
-from nmpm.zoo.entry_files import CONFIG, read_card
 from nmpm.zoo.speed_table import speed_tables
 
 if TYPE_CHECKING:

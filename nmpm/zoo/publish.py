@@ -25,8 +25,7 @@ from nmpm.emulator import Emulator
 from nmpm.emulator.adaptation import adapted
 from nmpm.errors import ZooError
 from nmpm.training.checkpoints import load_module, read_checkpoint
-from nmpm.zoo.card import CARD, FORMAT, intervals, stress_digest
-from nmpm.zoo.entry_files import BEST, CONFIG, SCENES, WEIGHTS
+from nmpm.zoo.card import BEST, CARD, CONFIG, FORMAT, SCENES, WEIGHTS, intervals, stress_digest
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.refresh import write_card, write_index, writing
 from nmpm.zoo.registry import check_name

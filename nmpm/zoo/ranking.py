@@ -13,10 +13,9 @@ from torch import Tensor
 
 from nmpm._support.messages import one_line
 from nmpm.data.dataset import Dataset
-from nmpm.data.loading.padded_batch import PaddedRecordings
-from nmpm.data.loading.recording import Recording
-from nmpm.data.motion import measure_motion
-from nmpm.data.split_files import split_paths
+from nmpm.data.format import split_paths
+from nmpm.data.survey import measure_motion
+from nmpm.data.windows import PaddedRecordings, Recording
 from nmpm.emulator import Emulator
 from nmpm.emulator.prescribed import predict_from_entries, with_predicted
 from nmpm.emulator.similarity import Match, find_match

@@ -14,9 +14,8 @@ from nmpm._support.atomic import atomic_write
 from nmpm._support.bounded_files import check_plain, to_yaml
 from nmpm._support.shipped import user_home
 from nmpm.errors import DataError, ZooError
-from nmpm.zoo.card import CARD
+from nmpm.zoo.card import CARD, read_card
 from nmpm.zoo.entries import load_entry
-from nmpm.zoo.entry_files import read_card
 from nmpm.zoo.measures.ensemble import ensemble_facts
 from nmpm.zoo.measures.model import invariant_facts, quality_facts, stress_facts, trust_facts
 from nmpm.zoo.measures.simulator import floor_facts, twin_facts

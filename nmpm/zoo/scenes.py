@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from nmpm._support.numbers import check_whole
+from nmpm._support.plain_data import check_whole
 from nmpm.data.format import Trajectory
-from nmpm.data.generate import preset_metadata
-from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.recording import RecordingReader
+from nmpm.data.recordings import RecordingReader
+from nmpm.data.simulation import preset_metadata
+from nmpm.data.windows import collate
 from nmpm.errors import DataError
 from nmpm.particles import Particles, Window
 from nmpm.scene import Reading, Scene

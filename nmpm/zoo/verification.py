@@ -16,15 +16,15 @@ import torch
 from torch import Tensor
 
 from nmpm._support.messages import one_line
-from nmpm._support.numbers import is_number
-from nmpm.data.initial_states import thrown_blocks
+from nmpm._support.plain_data import is_number
 from nmpm.emulator import Emulator, Prescribed, rollout
 from nmpm.emulator.prescribed import with_predicted
 from nmpm.errors import ZooError
 from nmpm.evaluation.bootstrap import interval
 from nmpm.metrics import MSE
+from nmpm.particles import thrown_blocks
+from nmpm.zoo.card import Rows, read_scenes
 from nmpm.zoo.entries import load_entry
-from nmpm.zoo.entry_files import Rows, read_scenes
 from nmpm.zoo.measures.ensemble import score_members
 from nmpm.zoo.measures.scenes import iterate_scenes
 from nmpm.zoo.optimization import fitting_count

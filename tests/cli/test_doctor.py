@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from nmpm.cli import doctor, doctor_facts, main
+from nmpm.cli import doctor, main
 from nmpm.zoo import self_test
 from nmpm.zoo.verification import Check
 
@@ -44,7 +44,7 @@ def test_what_is_broken_does_not_end_the_report(monkeypatch, capsys):
         yield "first", "known"
         raise ImportError("libcudart.so is missing")
 
-    monkeypatch.setattr(doctor, "sections", lambda: {"gpu": broken, "versions": doctor_facts.versions})
+    monkeypatch.setattr(doctor, "sections", lambda: {"gpu": broken, "versions": doctor.versions})
     monkeypatch.setattr(self_test, "self_test", lambda device: iter([]))
     monkeypatch.setattr(self_test, "speed", lambda device: "fast")
     assert main(["doctor"]) == 1
@@ -62,4 +62,4 @@ def test_what_is_broken_does_not_end_the_report(monkeypatch, capsys):
 )
 def test_instructions_are_read_from_linux(monkeypatch, cpuinfo, names):
     monkeypatch.setattr(Path, "read_text", lambda path: cpuinfo)
-    assert doctor_facts.instructions() == names
+    assert doctor.instructions() == names

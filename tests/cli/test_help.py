@@ -24,7 +24,7 @@ def narrow(monkeypatch):
     monkeypatch.setenv("COLUMNS", str(WIDTH))
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", list(COMMANDS))
 def test_the_help_of_a_command_has_examples_and_fits(command, capsys):
     text = help_of([command], capsys)
     assert f"  nmpm {command} " in text.partition("\nexamples:\n")[2]

@@ -1,6 +1,7 @@
 import json
 import re
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -48,6 +49,18 @@ def test_types_that_the_files_do_not_name_can_be_named(dataset, tmp_path, monkey
     monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
     assert main(["inspect", str(dataset), "--types", "7=honey", "--no-picture"]) == 0
     assert "honey (40-50)" in capsys.readouterr().out
+
+
+def test_types_that_are_found_to_rest_do_so_under_the_names_that_a_user_states(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+    rng = np.random.default_rng(0)
+    position = rng.uniform(0, 1, (4, 1, 40, 2)) + 1e-3 * rng.normal(size=(4, 30, 40, 2)).cumsum(axis=1)
+    position[:, :, 30:] = position[:1, :1, 30:]
+    np.savez(tmp_path / "a.npz", position=position, types=np.repeat([0, 1], [30, 10]))
+    assert main(["inspect", str(tmp_path / "a.npz"), "--types", "0=dust,1=grate", "--no-picture"]) == 0
+    said = capsys.readouterr().out
+    assert "30 particles + 10 at rest" in said
+    assert "nothing contradictory or odd found" in said
 
 
 def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch, capsys):

@@ -12,7 +12,7 @@ import yaml
 
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
-from nmpm.cli.emulator_cli import EmulatorCLI
+from nmpm.cli.run_training import EmulatorCLI
 from nmpm.data.format import Split, read_metadata, write_metadata, write_split
 from nmpm.scene import Reading
 from nmpm.zoo import Zoo
@@ -297,7 +297,7 @@ def test_models_are_ranked_by_data_whose_facts_are_stated(capsys):
     data = write_foreign(24, gravity=None)
     assert main(["zoo", "match", str(data), "--root", "zoo", "--gravity=0,-9.81e-3"]) == 0
     *_, first, use, start = capsys.readouterr().out.splitlines()
-    assert first == f"first state it:   nmpm convert {data} grains-stated --gravity=0,-9.81e-3"
+    assert first == f"first state it:   nmpm convert {data} grains-stated --gravity=0,-0.00981"
     assert use == "as it is:         nmpm rollout goop --data grains-stated"
     assert start == "to start from it: nmpm fit --start_from goop --data.path grains-stated"
     assert main(first.split()[4:]) == 0

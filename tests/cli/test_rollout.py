@@ -11,11 +11,11 @@ from nmpm.cli import main
 from nmpm.data import catalog
 from nmpm.data.convert import open_dataset
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.generate import generate
+from nmpm.data.simulation import generate
 from nmpm.emulator.trust import Trust
 from nmpm.sim import load_preset
 from nmpm.viz.files import read_labelled
-from nmpm.zoo.predictor import Predictor
+from nmpm.zoo.pretrained import Predictor
 
 
 @pytest.fixture(autouse=True)

@@ -10,7 +10,7 @@ from PIL import Image
 
 from nmpm.cli import main
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.loading.sources import FolderSource
+from nmpm.data.sources import FolderSource
 from nmpm.sim import preset_names
 from nmpm.sim.loading import preset_text
 

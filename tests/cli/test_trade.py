@@ -3,8 +3,8 @@ import re
 import shlex
 
 from nmpm.cli import main
-from nmpm.cli.trade import _models_of
-from nmpm.data.loading.sources import FolderSource
+from nmpm.cli.measure import _models_of
+from nmpm.data.sources import FolderSource
 from nmpm.evaluation.trade import read_scenes, shipped_sweep_text
 from nmpm.zoo import Pretrained, load_model
 from tests.evaluation.trade.made_up import SWEEP, tiny_emulator, tiny_scenes

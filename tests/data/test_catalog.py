@@ -26,7 +26,7 @@ def test_ensure_simulates_once_and_copies_what_another_folder_has(home, simulate
     np.testing.assert_array_equal(*(Split(path / "train.h5").read(0).position for path in (folder, more)))
 
 
-@pytest.mark.parametrize("ask", ["ensure", "scene", "describe"])
+@pytest.mark.parametrize("ask", ["ensure", "simulation_request", "describe"])
 def test_an_unknown_name_lists_the_known_ones(ask):
     with pytest.raises(DataError, match=r"'treacle'.*goop"):
         getattr(catalog, ask)("treacle")

@@ -12,7 +12,7 @@ from nmpm.data.convert import Options
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import METADATA_FILE
 from nmpm.data.inspection import inspect
-from nmpm.data.loading.sources import FolderSource
+from nmpm.data.sources import FolderSource
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Window
 

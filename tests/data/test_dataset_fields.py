@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 import torch
 
-from nmpm.data.arrays import write_trajectories
 from nmpm.data.convert import Options
 from nmpm.data.datamodule import TrajectoryDataModule
+from nmpm.data.dataset import write_trajectories
 from nmpm.data.format import Trajectory, read_metadata, write_metadata, write_split
 from nmpm.data.inspection import inspect
-from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.sources import FolderSource
 from nmpm.data.scene_inference import infer_scene
+from nmpm.data.sources import FolderSource
+from nmpm.data.windows import collate
 from nmpm.errors import ConfigError, DataError
 from tests.made_up import made_up_metadata, made_up_trajectory
 

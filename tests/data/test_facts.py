@@ -5,13 +5,13 @@ from itertools import islice
 import numpy as np
 import pytest
 
+from nmpm.data.boundaries import domain_fact
 from nmpm.data.convert import ForeignDataset, Options, convert, open_dataset
 from nmpm.data.convert.conversion import write_native
-from nmpm.data.facts import FactFinder, Facts, find_facts
-from nmpm.data.facts.boundaries import domain_fact
-from nmpm.data.facts.open_ends import roundest
+from nmpm.data.facts import FactFinder, FoundFacts, find_facts
 from nmpm.data.format import Metadata, Split, Trajectory, read_metadata, write_split
 from nmpm.data.scene_inference import infer_scene
+from nmpm.data.statistics import roundest
 from nmpm.errors import ConfigError, DataError
 
 PLACEHOLDERS = Metadata(((0.0, 1.0),) * 2, 1.0, 2, 0, {})
@@ -42,7 +42,7 @@ def thrown(rng: np.random.Generator, gravity: tuple[float, ...], frames: int = 6
     return np.stack(path)
 
 
-def facts_of(*positions: np.ndarray, types: np.ndarray | None = None, **fields: np.ndarray) -> Facts:
+def facts_of(*positions: np.ndarray, types: np.ndarray | None = None, **fields: np.ndarray) -> FoundFacts:
     finder = FactFinder(positions[0].shape[2])
     for position in positions:
         kinds = np.zeros(position.shape[1], int) if types is None else types

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from nmpm.data.array_checks import check_end
-from nmpm.data.format import Split, Trajectory, read_metadata, write_split
-from nmpm.data.split_files import split_paths
+from nmpm.data.format import Split, Trajectory, read_metadata, split_paths, write_split
 from nmpm.errors import DataError
 
 SHAPES = arrays.array_shapes(min_dims=3, max_dims=3, min_side=1, max_side=3)

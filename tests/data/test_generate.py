@@ -16,8 +16,7 @@ import pytest
 
 from nmpm.cli import main
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.generate import generate, generate_shard
-from nmpm.data.simulation import Shard, SimulationRequest, seed_of_draw
+from nmpm.data.simulation import Shard, SimulationRequest, generate, generate_shard, seed_of_draw
 from nmpm.errors import ConfigError, DataError, UnstableError
 from nmpm.sim import MpmPreset
 from tests.data.tiny_goop import COUNTS, GOOP, TINY, fingerprints
@@ -25,7 +24,7 @@ from tests.data.tiny_goop import COUNTS, GOOP, TINY, fingerprints
 SIMULATE = """
 import json, sys
 from pathlib import Path
-from nmpm.data.generate import generate_shard
+from nmpm.data.simulation import generate_shard
 from nmpm.data.simulation import Shard
 from nmpm.sim import preset_from_dict
 preset, folder, counts, shard = sys.argv[1:]

@@ -1,6 +1,6 @@
 import pytest
 
-from nmpm.data.grid_rule import GridFacts, Machine, candidates, grid_cost, grid_shape, recommended_cells
+from nmpm.data.grid_rule import GridFacts, Machine, TrainingSize, candidates, grid_cost, grid_shape, recommended_cells
 
 BOX = ((0.08, 0.92), (0.08, 0.92))
 # Particles per occupied cell that the shipped datasets have on grids of so many cells.
@@ -35,7 +35,7 @@ def test_slow_machines_and_fast_particles_get_coarser_grids():
 
 def test_memory_bounds_grids_in_three_dimensions():
     cube = facts({16: 30.0, 24: 20.0, 48: 18.0}, lambda n: (n, n, n))
-    cost = grid_cost((48, 48, 48), 2000, Machine(memory=2e9))
+    cost = grid_cost((48, 48, 48), 2000, Machine(memory=2e9), TrainingSize.of(3))
     assert not cost.fits
     assert cost.memory == pytest.approx(2.8e9, rel=0.1)
     assert recommended_cells(cube, 2000, Machine(slowness=0.01, memory=2e9)) == 24

@@ -8,7 +8,7 @@ import pytest
 from huggingface_hub.errors import LocalEntryNotFoundError
 
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.data.hub import REPOSITORY, hub_folder
+from nmpm.data.sources import REPOSITORY, hub_folder
 from nmpm.errors import ConfigError, DataError
 from tests.data.convert.test_neuralmpm import write
 

@@ -1,14 +1,13 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.data.format import METADATA_FILE, Metadata, read_metadata, write_metadata
-from nmpm.data.generate import preset_metadata
-from nmpm.data.metadata import unambiguous_family
+from nmpm.data.simulation import preset_metadata
+from nmpm.data.stated import guess_family, unambiguous_family
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim import load_preset
 
@@ -74,7 +73,12 @@ def test_a_family_where_the_file_does_not_name_types(write_keys):
     ("ids", "family"), [([5], "deepmind"), ([0, 7], "deepmind"), ([0], "lagrangebench"), ([0, 1, 3], None), ([9], None)]
 )
 def test_a_family_is_told_by_type_ids_that_only_one_has(ids, family):
-    assert unambiguous_family(np.array(ids)) == family
+    assert unambiguous_family(ids) == family
+
+
+def test_else_the_family_that_knows_most_of_the_ids_is_guessed():
+    assert guess_family((0, 1), {}) == guess_family((0, 3), {"periodic_boundary_conditions": []}) == "lagrangebench"
+    assert guess_family((0, 3), {}) == guess_family((99,), {}) == "deepmind"
 
 
 def test_lagrangebench_metadata(write_keys):

@@ -4,8 +4,8 @@ import yaml
 
 from nmpm.data.format import Trajectory, write_metadata, write_split
 from nmpm.data.grid_rule import Machine
-from nmpm.data.loading.sources import FolderSource
-from nmpm.data.new_configuration import Choice, CompletedSource, render_configuration
+from nmpm.data.new_configuration import CompletedSource, SettingsChoice
+from nmpm.data.sources import FolderSource
 from nmpm.errors import DataError
 from tests.made_up import made_up_metadata
 
@@ -34,9 +34,8 @@ def written(folder, *runs, splits=("train", "valid", "test"), **changes):
 
 
 def configured(folder, minutes=15):
-    source, facts = CompletedSource.of(FolderSource(folder)).look()
-    choice = Choice.of(source.data.scene, facts, Machine(minutes=minutes))
-    text = render_configuration(str(folder), source, choice, "runs/here")
+    choice = SettingsChoice.of(CompletedSource.of(FolderSource(folder)), Machine(minutes=minutes))
+    text = choice.configuration(str(folder), "runs/here")
     return yaml.safe_load(text), text
 
 

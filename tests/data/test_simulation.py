@@ -11,8 +11,7 @@ import time
 import pytest
 
 from nmpm.data import simulation
-from nmpm.data.generate import generate
-from nmpm.data.simulation import DRAWS, seed_of_draw, simulate_all
+from nmpm.data.simulation import DRAWS, generate, seed_of_draw, simulate_all
 from nmpm.errors import DataError, UnstableError
 from nmpm.sim import MpmPreset
 from tests.data.tiny_goop import COUNTS, TINY, fingerprints
@@ -24,7 +23,7 @@ SCRIPT = """
 import json, signal, sys
 from pathlib import Path
 from nmpm.data import simulation
-from nmpm.data.generate import generate
+from nmpm.data.simulation import generate
 from nmpm.sim import MpmPreset
 class Own(MpmPreset):
     pass

@@ -11,7 +11,7 @@ from nmpm.emulator.adaptation import adapted
 from nmpm.emulator.calibration import calibrate_unread, unread_inputs
 from nmpm.errors import ConfigError
 from nmpm.processors import Identity, Patched, Pointwise, UNet
-from nmpm.transfer.execution import without_kernels
+from nmpm.transfer import without_kernels
 from nmpm.zoo import Zoo
 from tests.scenes import box, cloud, emulator_of, window_of
 

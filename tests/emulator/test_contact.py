@@ -5,10 +5,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nmpm.data.initial_states import lattice
 from nmpm.emulator.engines.torch.contact import SURFACE, Contact
 from nmpm.emulator.rollouts import rollout
 from nmpm.grid import Grid
+from nmpm.particles import lattice
 from tests.scenes import box, cloud, emulator_of, with_obstacle
 
 GRID = Grid((20, 20), (0.0, 0.0), (1.0, 1.0), (False, False))

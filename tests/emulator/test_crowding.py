@@ -6,16 +6,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from nmpm.data.initial_states import lattice
 from nmpm.emulator import Emulator
 from nmpm.emulator.engines.torch.contact import SURFACE
 from nmpm.emulator.engines.torch.crowding import MAX_SHIFT, Crowding
 from nmpm.emulator.rollouts import rollout, unroll
 from nmpm.grid import Grid
-from nmpm.particles import Particles
+from nmpm.particles import Particles, lattice
 from nmpm.scene import Scene
-from nmpm.transfer import Linear
-from nmpm.transfer.linear import linear_g2p
+from nmpm.transfer import Linear, linear_g2p
 from tests.scenes import CHANNEL, box, cloud, emulator_of, with_obstacle
 
 

@@ -128,7 +128,7 @@ def test_particles_in_chunks_move_as_all_at_once(transfer, monkeypatch):
     with torch.no_grad(), without_kernels():
         whole = emulator(particles)
         in_sevens = lambda count, *_, **__: [slice(first, first + 7) for first in range(0, count, 7)]  # noqa: E731
-        monkeypatch.setattr("nmpm.transfer.transfer.chunks", in_sevens)
+        monkeypatch.setattr("nmpm.transfer.chunks", in_sevens)
         cut = emulator(particles)
     torch.testing.assert_close(cut.position, whole.position, rtol=0, atol=1e-6)
     torch.testing.assert_close(cut.velocity, whole.velocity, rtol=0, atol=1e-6)

@@ -10,13 +10,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from nmpm.data.initial_states import lattice
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip
 from nmpm.emulator import Emulator, RolloutContext, rollout
 from nmpm.emulator.engines import ENGINES, find_engine, graphs, rules
 from nmpm.emulator.engines.torch.engine import TorchEngine
 from nmpm.emulator.rollouts import recomputed
-from nmpm.particles import Particles
+from nmpm.particles import Particles, lattice
 from nmpm.processors import UNet
 from nmpm.training import recorded_steps
 from nmpm.transfer import without_kernels

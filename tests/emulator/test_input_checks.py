@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nmpm.emulator import rollout
-from nmpm.emulator.input_checks import check_inputs
+from nmpm.emulator.monitor import check_inputs
 from nmpm.errors import DataError
 from tests.scenes import box, cloud, emulator_of
 

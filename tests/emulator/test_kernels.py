@@ -10,11 +10,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nmpm.data.initial_states import lattice
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
 from nmpm.emulator.engines import find_engine
 from nmpm.emulator.engines.numba.engine import NumbaEngine
 from nmpm.emulator.rollouts import rollout
+from nmpm.particles import lattice
 from nmpm.training.losses import TrainingError
 from nmpm.transfer import Linear, Nearest, Quadratic, without_kernels
 from nmpm.zoo import Zoo

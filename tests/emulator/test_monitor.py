@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from nmpm import Zoo
-from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.emulator.monitor import Monitor, Policy, RolloutStoppedError
 from nmpm.emulator.rollouts import rollout, stream
+from nmpm.particles import lattice, state_at_rest
 from tests.scenes import box, cloud, emulator_of
 
 

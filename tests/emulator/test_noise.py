@@ -10,7 +10,7 @@ from nmpm.emulator.adaptation import adapted, with_noise
 from nmpm.emulator.noise import Noise
 from nmpm.errors import ConfigError
 from nmpm.processors import FNO, Axial, ConvNeXt, GridLayout, Patched, Pointwise, Stochastic, UNet, UNetModern
-from nmpm.transfer.execution import without_kernels
+from nmpm.transfer import without_kernels
 from tests.scenes import box, cloud, emulator_of
 
 PROCESSORS = [

@@ -7,7 +7,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.decoders import Absolute
 from nmpm.emulator import EmulatorRecipe, Prescribed, predict_rollout, rollout, unroll
 from nmpm.emulator.constraints import Constraints, mass_shares
@@ -18,7 +17,7 @@ from nmpm.emulator.rasterise import grid_state
 from nmpm.errors import ConfigError, DataError
 from nmpm.evaluation.comparison import Comparison, still
 from nmpm.metrics import MSE, EarthMover
-from nmpm.particles import Particles, Window
+from nmpm.particles import Particles, Window, lattice, state_at_rest
 from nmpm.processors import Pointwise
 from nmpm.transfer import Affine, Linear, Nearest, Quadratic, without_kernels
 from nmpm.zoo.export.parts import Network

@@ -5,14 +5,13 @@ import dataclasses
 import pytest
 import torch
 
-from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.decoders import Absolute
 from nmpm.emulator import Emulator, unroll
 from nmpm.emulator.engines.torch.support import REACH, Support
 from nmpm.emulator.monitor import Monitor
 from nmpm.emulator.rollouts import rollout
 from nmpm.grid import Grid
-from nmpm.particles import Particles
+from nmpm.particles import Particles, lattice, state_at_rest
 from nmpm.transfer import without_kernels
 from tests.scenes import CHANNEL, box, cloud, emulator_of, silenced
 

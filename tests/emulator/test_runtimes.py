@@ -7,7 +7,7 @@ import torch
 
 from nmpm.emulator import Emulator
 from nmpm.emulator.runtimes import FORMER, RUNTIMES, Eager, find_runtime, runtime
-from nmpm.emulator.runtimes.programs import Programs
+from nmpm.emulator.runtimes.runtime import Programs
 from nmpm.errors import ConfigError
 from tests.scenes import box, cloud, emulator_of
 

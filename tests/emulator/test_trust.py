@@ -5,12 +5,12 @@ import dataclasses
 import pytest
 import torch
 
-from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.emulator import predict_rollout
 from nmpm.emulator.members import predict_members
 from nmpm.emulator.monitor import Monitor, Policy
 from nmpm.emulator.trust import Trust, TrustTracker, calibrate, stream_watched, until_trusted
 from nmpm.errors import DataError
+from nmpm.particles import lattice, state_at_rest
 from tests.scenes import box, cloud, emulator_of, window_of
 
 SCENE = box()  # of 14 x 14 cells of 3 particle spacings

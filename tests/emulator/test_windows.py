@@ -9,7 +9,7 @@ import torch
 
 from nmpm.decoders import Absolute
 from nmpm.emulator import Emulator, Windows, rollout
-from nmpm.emulator.runtimes.grid_crops import BLOCK, Axis, cover_blocks, predict_on_crops
+from nmpm.emulator.runtimes.windows import BLOCK, Axis, cover_blocks, predict_on_crops
 from nmpm.errors import ConfigError
 from nmpm.processors import Axial, ConvNeXt, GridLayout, Patched, UNet
 from nmpm.transfer import without_kernels

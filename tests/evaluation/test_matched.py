@@ -10,7 +10,7 @@ from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.evaluation.comparison import free_fall
 from nmpm.evaluation.matched import MatchedPredictor
-from nmpm.evaluation.trade.fitted import fit_to_scenes
+from nmpm.evaluation.trade.sweep import fit_to_scenes
 from nmpm.particles import Window
 from nmpm.processors import Identity
 from nmpm.scene import Reading, Scene

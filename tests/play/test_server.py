@@ -108,17 +108,8 @@ def test_another_page_takes_over(server):
 
 
 @pytest.fixture
-def page(browser, server):
-    """The page, open; fails at the end if it logged an error."""
-    context = browser.new_context(viewport={"width": 500, "height": 500})
-    errors, page = [], context.new_page()
-    page.on("pageerror", lambda error: errors.append(str(error)))
-    page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-    page.goto(server.address)
-    wait_until(page, "window.play && play.stage && play.stage.drawn > 2")
-    yield page
-    context.close()
-    assert not errors
+def page(visit, server):
+    return visit(server.address, "window.play && play.stage && play.stage.drawn > 2", 500, 500)
 
 
 def at(page, point):

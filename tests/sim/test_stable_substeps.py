@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from nmpm.sim import load_preset, preset_names
-from nmpm.sim.mpm.solids import Goop
-from nmpm.sim.mpm.stability import fastest_speed, longest_particle_substep, longest_travel_substep
-from nmpm.sim.mpm.water import Water
+from nmpm.sim.mpm.materials import Goop, Water
+from nmpm.sim.mpm.preset import fastest_speed, longest_particle_substep, longest_travel_substep
 from nmpm.sim.preset import BOUNDARY
 
 FRAMES, COMPARED_FROM = 80, 60

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from nmpm._support.devices import computes_bfloat16, find_device
+from nmpm._support.machine import computes_bfloat16, find_device
 from nmpm.errors import ConfigError
 
 

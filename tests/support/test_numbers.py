@@ -2,7 +2,7 @@
 
 import pytest
 
-from nmpm._support.numbers import is_finite
+from nmpm._support.plain_data import is_finite
 
 
 @pytest.mark.parametrize("value", [10**400, -(10**400), float("inf"), float("nan"), True, "1", None])

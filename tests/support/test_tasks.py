@@ -40,7 +40,7 @@ SIMULATES = """
 import dataclasses, time
 from nmpm.data import simulation
 from nmpm._support.threads import Task
-from nmpm.data.loading.simulated import SimulatedRecordings
+from nmpm.data.simulated_sources import SimulatedRecordings
 from nmpm.sim import load_preset
 simulation.FRAMES_PER_PROCESS = 1
 recordings = SimulatedRecordings(dataclasses.replace(load_preset("goop"), frames=500_000), workers=2)

@@ -1,9 +1,9 @@
 import pytest
 import torch
 
-from nmpm.data import catalog
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
+from nmpm.sim import load_preset, preset_names
 from nmpm.training.augmentation import check_jitter, check_mirrors, mirror_half, mirror_windows, with_jitter
 from tests.scenes import box, cloud, emulator_of, window_of
 
@@ -51,9 +51,9 @@ def test_images_have_the_same_walls(changes, middle):
     torch.testing.assert_close(image.frames[~same][..., 0], 2 * middle - window.frames[~same][..., 0])
 
 
-@pytest.mark.parametrize("name", catalog.catalog())
+@pytest.mark.parametrize("name", preset_names())
 def test_embedded_datasets_can_be_mirrored(name):
-    scene = catalog.scene(name)
+    scene = load_preset(name).scene
     fall = scene.gravity or (0.0,) * scene.dim
     level = [axis for axis in range(scene.dim) if scene.gravity_varies or not fall[axis]]
     check_mirrors(scene, level)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.strategies import SingleDeviceStrategy
 
 from nmpm.training.callbacks.divergence import MOST_RISE, RECENT, DivergedError, DivergenceGuard
 
@@ -19,7 +20,7 @@ def follow(losses, savers=()):
             global_step=step,
             log_every_n_steps=20,
             checkpoint_callbacks=list(savers),
-            strategy=SimpleNamespace(root_device=torch.device("cpu")),
+            strategy=SingleDeviceStrategy("cpu"),
         )
         guard.on_train_batch_end(trainer, None, {"loss": torch.tensor(loss)}, None, 0)
 

@@ -267,9 +267,9 @@ HOLD = """
 import sys, time
 from pathlib import Path
 from nmpm.cli.run_folder import RunFolder
-RunFolder(Path(sys.argv[1]), {}).lock()
-print("locked", flush=True)
-time.sleep(60)
+with RunFolder(Path(sys.argv[1]), {}).lock():
+    print("locked", flush=True)
+    time.sleep(60)
 """
 
 
@@ -279,11 +279,12 @@ def test_a_folder_is_trained_in_by_one_process_and_free_again_when_that_is_kille
     try:
         assert held.stdout.readline() == "locked\n"
         with pytest.raises(ConfigError, match=rf"process \({held.pid}\) is training in"):
-            folder.lock()
+            folder.lock().__enter__()
     finally:
         held.kill()
         held.wait()
-    os.close(folder.lock())
+    with folder.lock():
+        pass
 
 
 def touch(*paths):

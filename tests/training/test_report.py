@@ -3,7 +3,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from nmpm._support.devices import device_name
+from nmpm._support.machine import device_name
 from nmpm.evaluation.figures import no_better_than_trivial
 from nmpm.training.callbacks.outputs import ReportWriter
 

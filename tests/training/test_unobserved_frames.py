@@ -9,7 +9,7 @@ import torch
 
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import write_metadata, write_split
-from nmpm.data.loading.sources import FolderSource
+from nmpm.data.sources import FolderSource
 from nmpm.emulator.calibration import calibrate
 from nmpm.evaluation.comparison import Comparison, free_fall
 from nmpm.evaluation.prediction_errors import Measures, measure_errors

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.transfer import scatter_backend
-from nmpm.transfer.execution import BACKENDS, add
+from nmpm.transfer import BACKENDS, add, scatter_backend
 
 GRID = Grid((17, 23), (0.0, 0.0), (1.0, 1.0), (False, True))
 HERE = [

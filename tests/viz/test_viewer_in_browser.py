@@ -18,24 +18,16 @@ WATER = (38, 112, 200)
 
 
 @pytest.fixture
-def open_page(browser, tmp_path):
-    """Opens a page, stopped at its first frame, in the materials' colours; fails at the end if it logged an error."""
-    context = browser.new_context(viewport={"width": 900, "height": 640})
-    errors = []
+def open_page(visit, tmp_path):
+    """Opens a page that shows trajectories, at the first frame."""
 
     def opened(trajectories):
         path = view(trajectories).write(tmp_path / "page.html")
-        page = context.new_page()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
-        page.goto(path.as_uri())
-        wait_until(page, "window.viewer && viewer.drawn > 0")
+        page = visit(path.as_uri(), "window.viewer && viewer.drawn > 0", 900, 640)
         page.evaluate("viewer.stopAt(0), viewer.setColour('material')")
         return page
 
-    yield opened
-    context.close()
-    assert not errors
+    return opened
 
 
 def one_particle(frames=40, dim=2):

@@ -15,12 +15,11 @@ import torch
 from scenes import box, cloud, with_obstacle
 
 from nmpm.cli import main
-from nmpm.data.initial_states import lattice
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.rollouts import unroll
 from nmpm.errors import ConfigError
-from nmpm.particles import Particles
+from nmpm.particles import Particles, lattice
 from nmpm.processors import GridLayout, GridProcessor, Pointwise, Processor
 from nmpm.scene import Scene
 from nmpm.transfer import Affine, Linear, Nearest

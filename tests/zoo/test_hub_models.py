@@ -10,7 +10,7 @@ from huggingface_hub.utils import _http
 from nmpm.cli import main
 from nmpm.errors import ZooError
 from nmpm.zoo import Zoo, load_model
-from nmpm.zoo.entry_files import FILES
+from nmpm.zoo.card import FILES
 from nmpm.zoo.hub import HubId, download, hub_metadata, pull, push
 from tests.zoo.fake_hub import serve
 

@@ -13,7 +13,7 @@ from nmpm.emulator.adaptation import with_noise
 from nmpm.errors import ZooError
 from nmpm.training.module import EmulatorModule
 from nmpm.zoo import Zoo, publish
-from nmpm.zoo.entry_files import read_scenes
+from nmpm.zoo.card import read_scenes
 from nmpm.zoo.publish import add, round_network, serialise
 
 

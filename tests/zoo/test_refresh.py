@@ -16,7 +16,7 @@ from nmpm.errors import ConfigError, UnstableError, ZooError
 from nmpm.evaluation.stress import QUICK, results
 from nmpm.evaluation.trade.ranking import Setting, at_equal_error
 from nmpm.sim import load_preset
-from nmpm.sim.predictability import nudge, twin_of
+from nmpm.sim.preset import nudge, twin_of
 from nmpm.zoo import Zoo, load_model
 from nmpm.zoo import refresh as module
 from nmpm.zoo.card import lifecycle, preset_of, stated_milliseconds

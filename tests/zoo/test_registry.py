@@ -14,7 +14,7 @@ from nmpm.emulator import unroll
 from nmpm.emulator.rollouts import rollout
 from nmpm.errors import ConfigError, DataError, ZooError
 from nmpm.zoo import Zoo, load_model
-from nmpm.zoo.choice import Limits
+from nmpm.zoo.registry import Limits
 
 SHIPPED = Zoo.list(shipped_folder("zoo"))
 GPU = {"hardware": "a GPU"}
@@ -61,10 +61,14 @@ def test_a_name_comes_before_a_folder_and_ones_own_entries_before_the_shipped(
     assert Zoo.folder("mine/small") == home / "zoo" / "mine" / "small"
 
 
-def test_an_entry_needs_neither_lightning_nor_matplotlib(tmp_path):
-    script = (
-        "import sys; from nmpm import Zoo; Zoo.load('goop'); assert not {'lightning', 'matplotlib'} & {*sys.modules}"
-    )
+def test_an_entry_needs_no_reader_of_data_and_no_large_library(tmp_path):
+    script = """
+import sys
+from nmpm import Zoo
+Zoo.load("goop")
+assert not {"lightning", "matplotlib", "scipy.signal", "scipy.spatial", "nmpm.data.convert"} & {*sys.modules}
+assert sum(name.startswith("nmpm.data") for name in sys.modules) <= 12
+"""
     subprocess.run([sys.executable, "-c", script], check=True, cwd=tmp_path)
 
 

@@ -12,7 +12,7 @@ from nmpm.emulator.adaptation import adapted
 from nmpm.errors import ConfigError, ZooError
 from nmpm.evaluation.bootstrap import interval
 from nmpm.zoo import Zoo
-from nmpm.zoo.entry_files import read_scenes
+from nmpm.zoo.card import read_scenes
 from nmpm.zoo.measures.scenes import iterate_scenes, simulator_of
 from nmpm.zoo.verification import TOLERANCE, golden_distance, verify, verify_entry
 

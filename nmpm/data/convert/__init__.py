@@ -1,13 +1,13 @@
 """Converts datasets of other formats into the native layout.
 
-Each format is one class in one file; `FORMATS` lists them in the order in which they are detected.
+Each format is one class in one file, imported when it is needed; `READERS` lists them.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
@@ -16,61 +16,56 @@ from pathlib import Path
 from nmpm._support.atomic import lock_folder
 from nmpm._support.shipped import user_home
 from nmpm._support.version import __version__
-from nmpm.data.convert.array_files import ArrayFiles
-from nmpm.data.convert.array_frames import ArrayFrames
-from nmpm.data.convert.base import DatasetFormat as DatasetFormat
 from nmpm.data.convert.base import ForeignDataset as ForeignDataset
 from nmpm.data.convert.base import Options as Options
-from nmpm.data.convert.conversion import renumber_types, write_native
-from nmpm.data.convert.csv_frames import CsvFrames
-from nmpm.data.convert.deepmind import DeepMind
-from nmpm.data.convert.dmcf import Dmcf
-from nmpm.data.convert.frame_files import FrameFormat
-from nmpm.data.convert.gns_npz import GnsNpz
-from nmpm.data.convert.gsd import Gsd
-from nmpm.data.convert.h5md import H5md
-from nmpm.data.convert.lammps import Lammps
-from nmpm.data.convert.native import Native, NativeFiles
-from nmpm.data.convert.nearest import describe_several, describe_unknown, has_splits, subfolders
-from nmpm.data.convert.neuralmpm import NeuralMpm
-from nmpm.data.convert.ply import Ply
-from nmpm.data.convert.retiming import retime
-from nmpm.data.convert.rollout_pickle import RolloutPickle
-from nmpm.data.convert.tecplot import Tecplot
-from nmpm.data.convert.tracks import Tracks
-from nmpm.data.convert.vtk import Vtk
-from nmpm.data.convert.vtkhdf import VtkHdf
-from nmpm.data.convert.xyz import Xyz
-from nmpm.data.format import METADATA_FILE, Split, is_native
+from nmpm.data.convert.base import Reader as Reader
+from nmpm.data.convert.base import is_selected
+from nmpm.data.format import METADATA_FILE, SPLITS, Split, is_native, is_no_data, split_paths
 from nmpm.data.gravity import check_gravity
-from nmpm.data.split_files import split_paths
 from nmpm.errors import ConfigError, DataError, NmpmError
+from nmpm.registry import Registry
 
 _log = logging.getLogger(__name__)
 _MOST_INNER = 100
 """Folders in a folder of no known format that are looked at."""
 
-FORMATS: tuple[DatasetFormat, ...] = (
-    Native(),
-    DeepMind(),
-    GnsNpz(),
-    NeuralMpm(),
-    Dmcf(),
-    RolloutPickle(),
-    NativeFiles(),
-    H5md(),
-    ArrayFiles(),
-    ArrayFrames(),
-    CsvFrames(),
-    Tracks(),
-    Vtk(),
-    VtkHdf(),
-    Ply(),
-    Lammps(),
-    Xyz(),
-    Gsd(),
-    Tecplot(),
+READERS: Registry[type[Reader]] = Registry(
+    "nmpm.readers",
+    "format",
+    {
+        "native": "nmpm.data.convert.native:Native",
+        "deepmind": "nmpm.data.convert.deepmind:DeepMind",
+        "gns-npz": "nmpm.data.convert.gns_npz:GnsNpz",
+        "neuralmpm": "nmpm.data.convert.neuralmpm:NeuralMpm",
+        "dmcf": "nmpm.data.convert.dmcf:Dmcf",
+        "rollout-pickle": "nmpm.data.convert.pickles:RolloutPickle",
+        "native-files": "nmpm.data.convert.native:NativeFiles",
+        "h5md": "nmpm.data.convert.h5md:H5md",
+        "arrays": "nmpm.data.convert.array_files:ArrayFiles",
+        "array-frames": "nmpm.data.convert.array_frames:ArrayFrames",
+        "csv-frames": "nmpm.data.convert.tables:CsvFrames",
+        "tracks": "nmpm.data.convert.tracks:Tracks",
+        "vtk": "nmpm.data.convert.vtk:Vtk",
+        "vtkhdf": "nmpm.data.convert.vtkhdf:VtkHdf",
+        "ply": "nmpm.data.convert.ply:Ply",
+        "lammps": "nmpm.data.convert.lammps:Lammps",
+        "xyz": "nmpm.data.convert.xyz:Xyz",
+        "gsd": "nmpm.data.convert.gsd:Gsd",
+        "tecplot": "nmpm.data.convert.tecplot:Tecplot",
+    },
 )
+"""Readers of formats, in the order in which formats are detected."""
+
+
+def summaries() -> dict[str, str]:
+    """A line on each format; of a reader that cannot be imported, why."""
+    lines = dict[str, str]()
+    for name in READERS:
+        try:
+            lines[name] = READERS[name].summary
+        except ConfigError as error:
+            lines[name] = str(error)
+    return lines
 
 
 def open_dataset(path: Path, format_name: str | None = None, options: Options | None = None) -> ForeignDataset:
@@ -80,47 +75,66 @@ def open_dataset(path: Path, format_name: str | None = None, options: Options | 
         DataError: if the path is missing, of no known format, or damaged.
         ConfigError: if there is no format of that name, or an option is invalid.
     """
-    options = options or Options()
-    as_stored = replace(options, resample=None, smooth=None)
-    dataset = _find_format(Path(path), format_name, options.files).open(Path(path), as_stored)
-    return retime(replace(dataset, unknown=dataset.unknown - as_stored.stated), options)
+    path, options = Path(path), options or Options()
+    if format_name is None:
+        reader = _detect(path, options.files)
+    else:
+        reader = READERS[format_name]()
+        if options.files is not None:
+            reader = reader.select(options.files)
+        reader = reader if reader.fixed_names or reader.recognises(path) else reader.with_any_name()
+    dataset = reader.open(path, replace(options, resample=None, smooth=None))
+    if options.dt is None and not options.changes_positions:
+        return dataset
+    from nmpm.data.convert.retiming import retime
+
+    return retime(dataset, options)
 
 
-def _find_format(path: Path, name: str | None, files: str | None = None) -> DatasetFormat:
-    """The format of that name, or else the first that recognises the path; for those files alone that are selected."""
-    formats = FORMATS if files is None else tuple(kind.select(files) for kind in FORMATS if kind.patterns)
-    names = ", ".join(kind.name for kind in FORMATS)
-    if name is not None:
-        for kind in formats:
-            if kind.name == name:
-                return kind if kind.patterns == () or kind.recognises(path) else kind.with_any_name()
-        raise ConfigError(f"No format is called {name!r}; known: {names}.")
+def _detect(path: Path, files: str | None = None) -> Reader:
+    """The reader of the first format that recognises a path, or those of its files whose names fit some patterns."""
+    from nmpm.data.convert.nearest import describe_several, describe_unknown
+
     if not path.exists():
         raise DataError(f"{path}: no such file or folder.")
     if path.is_file() and not path.stat().st_size:
         raise DataError(f"{path}: the file is empty. Copy, download or write it again.")
-    inner = list(islice(subfolders(path), _MOST_INNER))
-    if sum(map(has_splits, inner)) < 2:
-        for kind in formats:
+    inside = sorted(path.glob("*")) if path.is_dir() else ()
+    inner = list(islice((each for each in inside if each.is_dir() and not is_no_data(each.name)), _MOST_INNER))
+    if sum(map(_has_splits, inner)) < 2:
+        for reader in _readers_to_try(path, files):
             with suppress(NmpmError, OSError):
-                if kind.recognises(path):
-                    return kind
-        for kind in formats:
-            by_content = kind.with_any_name()
-            with suppress(NmpmError, OSError):
-                if isinstance(kind, FrameFormat) and kind.signature and by_content.recognises(path):
-                    return by_content
+                if reader.recognises(path):
+                    return reader
     if files is not None:
         raise DataError(f"{path}: --files {files}: no file of these names is of a format that is read.")
     datasets = [folder for folder in inner if _is_dataset(folder)]
     raise DataError(describe_several(path, datasets) if datasets else describe_unknown(path))
 
 
+def _readers_to_try(path: Path, files: str | None) -> Iterator[Reader]:
+    """Readers that a file's name fits, or all for a folder; then those that go by the first bytes of files."""
+    for by_content in (False, True):
+        for kind in READERS.values():
+            if (by_content and not kind.signature) or (files is not None and kind.fixed_names):
+                continue
+            reader = kind() if files is None else kind().select(files)
+            if by_content:
+                yield reader.with_any_name()
+            elif not path.is_file() or not kind.patterns or is_selected(Path(path.name), kind.patterns):
+                yield reader
+
+
 def _is_dataset(folder: Path) -> bool:
     """Whether a folder is of a known format, as a whole."""
     with suppress(NmpmError, OSError):
-        return bool(_find_format(folder, None))
+        return bool(_detect(folder))
     return False
+
+
+def _has_splits(folder: Path) -> bool:
+    """Whether a folder has files or folders called train, valid or test, and is a dataset of its own."""
+    return folder.name not in SPLITS and any(inner.name.split(".")[0] in SPLITS for inner in folder.glob("*"))
 
 
 def convert(
@@ -148,6 +162,8 @@ def convert(
         DataError: if the source is missing, damaged or of no known format, or the destination exists.
         ConfigError: if there is no format of that name, or an option is invalid.
     """
+    from nmpm.data.convert.conversion import renumber_types, write_native
+
     dataset = open_dataset(source, format_name, options)
     return write_native(renumber_types(dataset, ids) if ids else dataset, destination, problems)
 
@@ -216,11 +232,7 @@ def _fingerprint(path: Path, options: Options, format_name: str | None) -> str:
     states = [(str(file.relative_to(path)), file.stat()) for file in files if file.is_file()]
     stamps = [(name, state.st_size, state.st_mtime_ns) for name, state in states]
     # Mappings and sets of equal content may have another order.
-    ordered = [
-        sorted(value.items() if isinstance(value, Mapping) else value)
-        if isinstance(value, Mapping | frozenset)
-        else value
-        for value in vars(options).values()
-    ]
+    ordered = [sorted(dict(value).items()) if isinstance(value, Mapping) else value for value in vars(options).values()]
+    ordered = [sorted(value) if isinstance(value, frozenset) else value for value in ordered]
     identity = repr((__version__, str(path), ordered, stamps, format_name))
     return hashlib.sha256(identity.encode()).hexdigest()[:10]

@@ -3,6 +3,10 @@
 A file holds one run, or several: stacked, numbered, or in groups (`nmpm.data.convert.run_arrays`). A folder of `.npy`
 files of which one is called positions, and the others types, velocities and the like, is one run. Objects are not
 unpickled.
+
+MATLAB's files of v7.3 are HDF5; older ones are read by scipy in a child process. Fields of structs are named
+`struct/field`, entries of cells `cell_0`, `cell_1`, …; axes of one are left out, as MATLAB adds them to vectors and
+numbers.
 """
 
 from __future__ import annotations
@@ -10,8 +14,10 @@ from __future__ import annotations
 import math
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,22 +25,19 @@ import h5py
 import numpy as np
 
 from nmpm._support.bounded_files import EXPANSION, NPZ_ERRORS, check_regular, expansion_limit
+from nmpm._support.isolated import call_isolated
 from nmpm._support.messages import one_line
-from nmpm.data.convert.base import readable, split_files
-from nmpm.data.convert.mat import open_mat
+from nmpm.data.convert.base import Facts, Options, Run, RunFiles, readable, split_files
 from nmpm.data.convert.named_arrays import USUAL_NAMES, ArrayLike, Arrays, describe, plain_name
 from nmpm.data.convert.run_arrays import group_runs
-from nmpm.data.convert.run_files import Facts, Run, RunFiles
-from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.format import VTKHDF, Metadata, Trajectory, is_no_data
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
-from nmpm.data.split_files import is_no_data
 from nmpm.errors import DataError
 
 
 class ArrayFiles(RunFiles):
     """Files of arrays: positions (T, N, D) or (R, T, N, D), and whatever fits them."""
 
-    name: ClassVar[str] = "arrays"
     summary: ClassVar[str] = "positions (T, N, D) or (R, T, N, D) in .npz, .npy, .h5, .mat, by usual names"
     patterns: tuple[str, ...] = ("*.npz", "*.npy", "*.h5", "*.hdf5", "*.mat")
 
@@ -58,7 +61,7 @@ class ArrayFiles(RunFiles):
         numbered = [group for group in groups for _ in range(group.count)]
         return [Run(file, index, group.frames, group.split) for index, group in enumerate(numbered)]
 
-    def facts(self, file: Path) -> Facts:
+    def facts(self, file: Path, options: Options) -> Facts:  # noqa: ARG002
         with open_arrays(file) as arrays:
             return next(group_runs(arrays, str(file))).facts()
 
@@ -89,19 +92,21 @@ def open_arrays(path: Path) -> Iterator[Arrays]:
     """
     if path.is_dir():
         yield {file.stem: _open_npy(file) for file in _npy_files(path)}
-    elif path.suffix == ".npy":
+        return
+    check_regular(path)
+    if path.suffix == ".npy":
         yield {"position": _open_npy(path)}
-    elif path.suffix == ".mat":
-        with open_mat(path) as arrays:
-            yield arrays
     elif path.suffix == ".npz":
         members = npz_members(path)
         with zipfile.ZipFile(path) as archive:
             yield {name: NpzArray(archive, name, f"{path}: {one_line(name, 60)}") for name in members}
+    elif path.suffix == ".mat" and not h5py.is_hdf5(path):
+        yield call_isolated(read_mat, path)
     else:
         with open_hdf5(path) as file:
             check_self_contained(file, path)
-            yield dict(_hdf5_arrays(file, path))
+            arrays = _hdf5_arrays(file, path)
+            yield dict(_as_in_matlab(arrays, file, path) if path.suffix == ".mat" else arrays)
 
 
 def _npy_files(folder: Path) -> list[Path]:
@@ -116,7 +121,7 @@ def _open_npy(path: Path) -> np.ndarray:
 
 
 def _hdf5_arrays(file: Any, path: Path) -> Iterator[tuple[str, ArrayLike]]:
-    """Datasets and numbers in attributes, by path in the file."""
+    """Datasets and numbers in attributes, by path in the file; groups of soft links have another name."""
     pending = [file]
     while pending:
         group = pending.pop()
@@ -126,13 +131,67 @@ def _hdf5_arrays(file: Any, path: Path) -> Iterator[tuple[str, ArrayLike]]:
                 yield prefix + name, np.asarray(value)
         groups = []
         for name in group:
-            item = group.get(name)
+            item, linked = group.get(name), isinstance(group.get(name, getlink=True), h5py.SoftLink)
             if isinstance(item, h5py.Dataset) and item.shape is not None:
                 check_stored_size(item, f"{path}: {prefix}{name}")
                 yield prefix + name, item
-            elif isinstance(item, h5py.Group) and name != "VTKHDF":
+            elif isinstance(item, h5py.Group) and not linked and name not in (VTKHDF, "#refs#"):
                 groups.append(item)
         pending += reversed(groups)
+
+
+def _as_in_matlab(arrays: Iterator[tuple[str, Any]], file: Any, path: Path) -> Iterator[tuple[str, ArrayLike]]:
+    """The datasets of numbers with MATLAB's axes; the entries of cells, which the group `#refs#` holds, by number."""
+    for name, array in arrays:
+        items = [(name, array)]
+        if array.dtype == h5py.ref_dtype:
+            entries = (file[reference] for reference in array[()].T.flat if reference)
+            items = [(f"{name}_{index}", entry) for index, entry in enumerate(entries)]
+        for where, item in items:
+            numbers = isinstance(item, h5py.Dataset) and item.dtype.kind in "biuf"
+            if numbers and item.attrs.get("MATLAB_class") != b"char":
+                check_stored_size(item, f"{path}: {where}")
+                yield where, _AsInMatlab(item)
+
+
+@dataclass(frozen=True)
+class _AsInMatlab:
+    """A dataset with its axes as in MATLAB, which stores the last one first, but for those of size one."""
+
+    dataset: Any
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(size for size in reversed(self.dataset.shape) if size != 1)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        kind: np.dtype[Any] = self.dataset.dtype
+        return kind
+
+    def __getitem__(self, rows: Any) -> np.ndarray:
+        return np.asarray(np.asarray(self.dataset[()]).T.reshape(self.shape)[rows])
+
+
+def read_mat(path: str) -> dict[str, np.ndarray]:
+    """The arrays of a MATLAB file before v7.3, by name; for child processes."""
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    def flat(name: str, value: Any) -> Iterator[tuple[str, np.ndarray]]:
+        if isinstance(value, dict):
+            for key, inner in value.items():
+                yield from flat(f"{name}/{key}" if name else str(key), inner)
+        elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype.hasobject):
+            for index, inner in enumerate(value):
+                yield from flat(f"{name}_{index}", inner)
+        elif (array := np.asarray(value)).dtype.kind in "biufUS":
+            yield name, array
+
+    errors = (MatReadError, zlib.error, TypeError, LookupError, ArithmeticError, NotImplementedError, RecursionError)
+    with readable(path, "a MATLAB file", *errors):
+        content = loadmat(path, simplify_cells=True)
+        return dict(flat("", {name: value for name, value in content.items() if not name.startswith("__")}))
 
 
 class NpzArray:
@@ -162,12 +221,11 @@ class NpzArray:
                 f"{self._where}: holds Python objects, which are not unpickled. Save numbers, or texts by .astype(str)."
             )
         if isinstance(rows, tuple):
-            return self._read(0, math.prod(self.shape)).reshape(self.shape, order="F" if self._fortran else "C")
+            return self._read(0, self.shape).reshape(self.shape, order="F" if self._fortran else "C")
         if self._fortran:
             whole: np.ndarray = self[()][rows]
             return whole
-        size = math.prod(self.shape[1:])
-        return self._read(rows * size, size).reshape(self.shape[1:])
+        return self._read(rows, self.shape[1:]).reshape(self.shape[1:])
 
     def pickled(self) -> bytes:
         """The content of an array of objects."""
@@ -176,9 +234,11 @@ class NpzArray:
             content: bytes = self._file.read()
             return content
 
-    def _read(self, first: int, count: int) -> np.ndarray:
+    def _read(self, block: int, shape: tuple[int, ...]) -> np.ndarray:
+        """The numbers of one of the blocks of equal shape that follow each other."""
+        count = math.prod(shape)
         with readable(self._where, "an array", *NPZ_ERRORS):
-            self._file.seek(self._start + first * self.dtype.itemsize)
+            self._file.seek(self._start + block * count * self.dtype.itemsize)
             data = self._file.read(count * self.dtype.itemsize)
             if len(data) != count * self.dtype.itemsize:
                 raise ValueError(f"{len(data)} bytes are not {count} numbers of {self.dtype}")

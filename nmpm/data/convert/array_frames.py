@@ -16,9 +16,8 @@ from typing import ClassVar
 import numpy as np
 
 from nmpm.data.convert.array_files import ArrayFiles, open_arrays
-from nmpm.data.convert.file_kinds import by_kind, is_other_name
-from nmpm.data.convert.frame import Frame, join_frames
-from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.data.convert.frame_files import FrameFormat, by_kind, is_other_name
+from nmpm.data.convert.frames import Frame, join_frames
 from nmpm.data.convert.named_arrays import (
     ArrayLike,
     Arrays,
@@ -35,7 +34,6 @@ _FRAME_NAME = re.compile(r"(?:arr|frame|iter|iteration|output|snapshot|state|ste
 class ArrayFrames(FrameFormat):
     """A file, or a group, per frame."""
 
-    name: ClassVar[str] = "array-frames"
     summary: ClassVar[str] = "a file per frame of arrays in .npz, .npy, .h5, .hdf5: positions (N, D), or x, y, z"
     patterns: tuple[str, ...] = ArrayFiles.patterns
 

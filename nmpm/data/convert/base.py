@@ -1,24 +1,32 @@
-"""The interface of format readers: a reader is one subclass of `DatasetFormat` in one file, listed in `FORMATS`."""
+"""The interface of readers: a reader is a subclass of `RunFiles`, or of `frame_files.FrameFormat`, listed in `READERS`.
+
+data/train/0.npz, data/valid/0.npz      splits by folders, also "val", "training", …
+data/train_0.npz, data/test.npz         or by names of files
+data/0.npz, data/1.npz                  or by nothing: the last tenths of the runs validate and test
+"""
 
 from __future__ import annotations
 
 import abc
 import copy
-import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib.util import find_spec
+from itertools import groupby
 from pathlib import Path, PurePosixPath
-from typing import Any, ClassVar, Self, get_args
+from typing import Any, ClassVar, Self, TypeVar
 
-from nmpm._support.messages import one_line, suggestion
-from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.metadata import STATIC_NAMES
-from nmpm.data.split_files import OTHER_NAMES, SPLITS, is_no_data
+import numpy as np
+
+from nmpm._support.bounded_files import check_regular
+from nmpm._support.messages import counted, install, one_line
+from nmpm.data.format import ID, OTHER_NAMES, SPLITS, Metadata, Trajectory, is_no_data
+from nmpm.data.stated import Options as Options
+from nmpm.data.stated import find_family
 from nmpm.errors import ConfigError, DataError, NmpmError
-from nmpm.scene import Boundary, Interval, check_field_names
 
 UNKNOWN_LENGTH = 0
 """`Metadata.sequence_length` where the files do not state it; the conversion sets the length that it finds."""
@@ -26,108 +34,12 @@ UNKNOWN_LENGTH = 0
 ANY_NAME = ("*",)
 """Patterns of a reader that goes by the content of files."""
 
-AXES = "axes"
-"""Key of `metadata.json`: the order of the axes of positions, where a user states it."""
-_SETTLED = ("bounds", "dt", "gravity", "boundary")
-
-
-@dataclass(frozen=True)
-class Options:
-    """Facts that a user states where the files are silent or wrong; None takes what the files state.
-
-    Raises:
-        ConfigError: for another boundary, or a name that no field can have.
-    """
-
-    family: str | None = None  # meaning of the type ids: "deepmind", "lagrangebench", "jax-sph"
-    types: Mapping[int, str] | None = None  # names of type ids; they override those of the family and the files
-    static: frozenset[int] | None = None  # type ids that do not move
-    prescribed: frozenset[int] | None = None  # type ids of obstacles that move as recorded, such as a paddle
-    bounds: Sequence[Interval] | None = None  # where particles may be, (lower, upper) per axis, in domain length
-    dt: float | None = None  # time between stored frames, in seconds
-    gravity: Sequence[float] | None = None  # acceleration in length/s² per axis
-    boundary: Sequence[Boundary] | None = None  # "wall", "periodic" or "open" per axis
-    axes: str | None = None  # "TND" states that positions are frames, particles, axes, though they look swapped
-    fields: Sequence[str] | None = None  # names of the fields that are inputs of models
-    resample: float | None = None  # time between frames that positions are interpolated to
-    smooth: int | None = None  # frames of the local quadratic fit that replaces positions
-    files: str | None = None  # patterns of the names of the files to read, such as "Part{Fluid,Bound}_*"
-
-    def __post_init__(self) -> None:
-        if self.boundary is not None and not set(self.boundary) <= set(get_args(Boundary)):
-            raise ConfigError(f"boundary = {list(self.boundary)} must be {', '.join(get_args(Boundary))} per axis.")
-        if self.axes not in (None, "TND"):
-            raise ConfigError(f"axes = {self.axes}: positions are read as TND: frames, particles, axes. Swap others.")
-        check_field_names(self.fields or ())
-        if self.resample is not None and not 0 < self.resample < math.inf:
-            raise ConfigError(f"resample = {self.resample} must be positive: the time between the new frames.")
-        if self.smooth is not None and (self.smooth < 5 or self.smooth % 2 == 0):
-            raise ConfigError(f"smooth = {self.smooth} must be an odd number of frames, 5 or more.")
-
-    @property
-    def changes_positions(self) -> bool:
-        """Whether files in the native layout cannot be used as they are."""
-        return self.resample is not None or self.smooth is not None
-
-    @property
-    def of_converted(self) -> Options:
-        """The same for data that are resampled and smoothed already."""
-        return replace(self, dt=self.resample or self.dt, resample=None, smooth=None, files=None)
-
-    @property
-    def stated(self) -> frozenset[str]:
-        """Fields of the metadata that these facts settle; names of types may be of some types only."""
-        given = {"static_types": self.static, **{name: getattr(self, name) for name in _SETTLED}}
-        return frozenset(name for name, value in given.items() if value is not None)
-
-    def apply_to(self, metadata: Metadata) -> Metadata:
-        """The metadata with the user's corrections; the family is applied where the type ids are read.
-
-        Raises:
-            ConfigError: if a value does not match the number of axes, or is invalid.
-        """
-        for name in ("bounds", "gravity", "boundary"):
-            value = getattr(self, name)
-            if value is not None and len(value) != metadata.dim:
-                raise ConfigError(f"{name} = {list(value)} needs one entry for each of the data's {metadata.dim} axes.")
-        if self.dt is not None and not self.dt > 0:
-            raise ConfigError(f"dt = {self.dt} must be positive: seconds between stored frames.")
-        if self.static and self.prescribed and self.static & self.prescribed:
-            raise ConfigError(
-                f"static = {sorted(self.static)} and prescribed = {sorted(self.prescribed)} share types: those"
-                " that move as recorded are prescribed only."
-            )
-        if self.types:
-            walls = frozenset(i for i, name in self.types.items() if name in STATIC_NAMES)
-            static = (metadata.static_types - frozenset(self.types)) | walls
-            prescribed = metadata.prescribed_types - frozenset(self.types)
-            names = metadata.particle_types | dict(self.types)
-            metadata = replace(metadata, particle_types=names, static_types=static, prescribed_types=prescribed)
-        if self.static:
-            metadata = replace(metadata, prescribed_types=metadata.prescribed_types - self.static)
-        changes: dict[str, Any] = {"static_types": self.static, "prescribed_types": self.prescribed}
-        changes["dt"] = self.resample or self.dt
-        changes["extra"] = metadata.extra | {AXES: self.axes} if self.axes else None
-        if self.bounds is not None:
-            changes |= {"bounds": tuple((float(low), float(high)) for low, high in self.bounds)}
-            metadata = replace(metadata, domain=None)
-        if self.gravity is not None:
-            changes["gravity"] = tuple(map(float, self.gravity))
-        if self.boundary is not None:
-            changes["boundary"] = tuple(self.boundary)
-        if self.fields is not None:
-            changes["fields"] = tuple(self.fields)
-        return replace(metadata, **{name: value for name, value in changes.items() if value is not None})
-
-
-def make_options(facts: Mapping[str, Any]) -> Options:
-    """The options of these names; raises a ConfigError for a name that is none of them."""
-    names = [field.name for field in fields(Options)]
-    unknown = next((name for name in facts if name not in names), None)
-    if unknown is not None:
-        raise ConfigError(f"{unknown} is no fact; known: {', '.join(names)}.{suggestion(unknown, names)}")
-    sets = {name: frozenset(value) for name, value in facts.items() if name in ("static", "prescribed") and value}
-    return Options(**{**facts, **sets})
+LEAST_FRAMES = 16
+"""Frames of the parts for validation and tests when one or two runs are cut along time."""
+EVERYTHING_UNKNOWN = frozenset(
+    {"bounds", "dt", "gravity", "static_types", "boundary", "particle_volume", "sequence_length", "particle_types"}
+)
+_CUT = "Cut along time: the first 80% of the frames train, then 10% valid, 10% test."
 
 
 @dataclass(frozen=True)
@@ -137,30 +49,65 @@ class ForeignDataset:
     metadata: Metadata
     splits: Mapping[str, Callable[[], Iterator[Trajectory]]]  # of "train", "valid", "test": starts to read trajectories
     notes: tuple[str, ...] = ()  # for the user, on assumptions and inconsistencies
-    counts: Mapping[str, int | None] = field(default_factory=dict)  # None where only reading all would tell
+    counts: Mapping[str, int] = field(default_factory=dict)  # trajectories of the splits, as far as they are counted
     assumed: frozenset[str] = frozenset()  # fields of the metadata that the files do not state
     unknown: frozenset[str] = frozenset()  # fields of the metadata that are to be found in the trajectories
     steps: bool = False  # whether times are numbers of a simulator's steps, of a length that the files do not state
     whole: ForeignDataset | None = None  # the same without cuts, where runs were cut along time into splits
 
+    def map(self, change: Callable[[Trajectory], Trajectory], metadata: Metadata | None = None) -> ForeignDataset:
+        """The dataset with each trajectory changed as it is read, and perhaps other metadata."""
 
-class DatasetFormat(abc.ABC):
+        def changed(start: Callable[[], Iterator[Trajectory]]) -> Iterator[Trajectory]:
+            return map(change, start())
+
+        splits = {name: partial(changed, start) for name, start in self.splits.items()}
+        return replace(self, splits=splits, metadata=metadata or self.metadata)
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Facts that the first file of a dataset states, before the user's corrections."""
+
+    metadata: Metadata  # with placeholders for what is unknown
+    unknown: frozenset[str] = frozenset()  # fields of the metadata that are to be found in the trajectories
+    notes: tuple[str, ...] = ()  # for the user
+    assumed: frozenset[str] = frozenset()  # fields of the metadata that the files do not state
+    steps: bool = False  # whether times are numbers of a simulator's steps
+    has_family: bool = False  # whether the types are named by the family that the user states, where he does
+
+
+def placeholder_metadata(dim: int, **facts: Any) -> Metadata:
+    """Metadata with these facts, and placeholders for all others."""
+    values: dict[str, Any] = {"bounds": ((0.0, 1.0),) * dim, "dt": 1.0, "particle_types": {}}
+    return Metadata(dim=dim, sequence_length=UNKNOWN_LENGTH, **(values | facts))
+
+
+class Reader(abc.ABC):
     """Abstract reader of a format, one subclass per format.
 
     Attributes:
-        name: The format's name.
         summary: One line for the command line's help.
-        patterns: Of the files' names; none where names are fixed.
+        patterns: Of the files' names.
+        fixed_names: Whether files of other names are never of the format, whatever the user states.
         selected: Further patterns, which the user states.
+        signature: Bytes that files begin with, by which they are recognised where their names have no usual suffix.
     """
 
-    name: ClassVar[str]
     summary: ClassVar[str]
     patterns: tuple[str, ...] = ()
+    fixed_names: ClassVar[bool] = False
     selected: tuple[str, ...] = ()
+    signature: ClassVar[bytes] = b""
 
     def select(self, files: str) -> Self:
-        """The same reader of those files alone whose names fit one of these patterns, separated by commas."""
+        """The same reader of those files alone whose names fit one of these patterns, separated by commas.
+
+        Raises:
+            ConfigError: if the format has fixed names.
+        """
+        if self.fixed_names:
+            raise ConfigError(f"--files {files}: the names of files of this format are fixed. Leave it out.")
         selecting = copy.copy(self)
         selecting.selected = tuple(pattern.strip() for pattern in files.split(","))
         return selecting
@@ -180,60 +127,170 @@ class DatasetFormat(abc.ABC):
         """Opens a dataset; raises a DataError that names the file if it is missing, damaged or of another format."""
 
 
-class FileFormat(DatasetFormat):
-    """Abstract reader of a format whose trajectories lie in files of one kind, one subclass per format.
+@dataclass(frozen=True)
+class Run:
+    """A run in a file."""
 
-    The files of the splits are in folders called train, valid and test, or have names that begin so; other files, and a
-    file alone, are the test split.
+    file: Path
+    index: int  # which of the file's runs it is
+    frames: int = 0  # 0 where a run must be read to count them
+    split: str | None = None  # where names in the file state one
+    part: range | None = None  # frames to take; None for all
+
+    def take(self, trajectory: Trajectory) -> Trajectory:
+        """The part of its whole trajectory."""
+        return trajectory if self.part is None else cut(trajectory, self.part)
+
+
+SomeRun = TypeVar("SomeRun", bound=Run)
+
+
+class RunFiles(Reader):
+    """Abstract reader of a format whose files hold one run or several each, one subclass per format.
 
     Attributes:
-        pattern: Of the files' names.
-        family: Meaning of the type ids where the user names no family.
-        assumed: Fields of the metadata that the files do not state.
+        unsplit: The split of files that nothing divides; "all" is divided by `divide`.
     """
 
-    pattern: ClassVar[str]
-    family: ClassVar[str] = "deepmind"
-    assumed: ClassVar[frozenset[str]] = frozenset()
-
-    @abc.abstractmethod
-    def metadata(self, file: Path, options: Options) -> tuple[Metadata, tuple[str, ...]]:
-        """Facts about the dataset from its first file, before the user's corrections, and notes for the user."""
-
-    @abc.abstractmethod
-    def read(self, file: Path, metadata: Metadata, options: Options) -> Iterator[Trajectory]:
-        """Yields the trajectories of a file; raises a DataError that names it if it is damaged."""
-
-    def count(self, file: Path) -> int | None:  # noqa: ARG002 (for subclasses)
-        """Number of trajectories in a file; None where only reading them all would tell."""
-        return 1
+    unsplit: ClassVar[str] = "all"
 
     def recognises(self, path: Path) -> bool:
-        return bool(split_files(path, self.pattern))
+        return bool(self.files(path))
+
+    def runs(self, file: Path) -> Sequence[Run]:
+        """The runs in a file, in order; one where a subclass does not say it."""
+        return [Run(file, 0)]
+
+    @abc.abstractmethod
+    def facts(self, file: Path, options: Options) -> Facts:
+        """What the first file states; of the user's facts, those that are needed to read it are used."""
+
+    @abc.abstractmethod
+    def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:
+        """Yields some of the runs of a file, in ascending order; raises a DataError that names it if it is damaged."""
+
+    def files(self, path: Path) -> dict[str, tuple[Path, ...]]:
+        """The files of each split; those that nothing divides are `unsplit`."""
+        files = split_files(path, *self.patterns, unsplit=self.unsplit)
+        kept = {
+            split: tuple(file for file in inside if is_selected(file, self.selected)) for split, inside in files.items()
+        }
+        return {split: inside for split, inside in kept.items() if inside}
 
     def open(self, path: Path, options: Options) -> ForeignDataset:
-        files = split_files(path, self.pattern)
+        files = self.files(path)
         if not files:
-            raise DataError(f"{path}: no file {self.pattern} there.")
-        stated, notes = self.metadata(next(iter(files.values()))[0], options)
-        metadata = options.apply_to(stated)
-        counts = {split: [self.count(file) for file in paths] for split, paths in files.items()}
-        renamed = (
-            f"{paths[0].name} becomes the {split} split."
-            for split, paths in files.items()
-            if len(paths) == 1 and split not in (paths[0].stem, paths[0].parent.name)
-        )
-        return ForeignDataset(
-            metadata,
-            {split: partial(self._read_all, paths, metadata, options) for split, paths in files.items()},
-            (f"Particle types have the meaning of the {options.family or self.family} family.", *notes, *renamed),
-            {split: None if None in each else sum(number or 0 for number in each) for split, each in counts.items()},
-            self.assumed,
-        )
+            raise DataError(f"{path}: no file {' or '.join(self.patterns)} there.")
+        runs = {split: [run for file in paths for run in self.runs(file)] for split, paths in files.items()}
+        facts = self.facts(next(iter(files.values()))[0], options)
+        if len(runs.get("all", ())) in (1, 2):  # they may be cut along time
+            runs["all"] = [replace(run, frames=run.frames or self._count(run, facts.metadata)) for run in runs["all"]]
+        return open_divided(runs, facts, self._read_all, options)
 
-    def _read_all(self, files: tuple[Path, ...], metadata: Metadata, options: Options) -> Iterator[Trajectory]:
-        for file in files:
-            yield from self.read(file, metadata, options)
+    def _count(self, run: Run, metadata: Metadata) -> int:
+        with suppress(DataError):  # raised again where the run is needed
+            return len(next(self.read(run.file, [run.index], metadata)).position)
+        return 0
+
+    def _read_all(self, runs: Sequence[Run], metadata: Metadata) -> Iterator[Trajectory]:
+        for file, group in groupby(runs, lambda run: run.file):
+            inside = list(group)
+            trajectories = self.read(file, [run.index for run in inside], metadata)
+            for run, trajectory in zip(inside, trajectories, strict=True):
+                yield run.take(trajectory)
+
+
+class DescribedFiles(RunFiles):
+    """Abstract reader of a format whose files, or files beside them, describe the scene.
+
+    Attributes:
+        family: Meaning of the type ids where the user names no family.
+    """
+
+    fixed_names: ClassVar[bool] = True
+    unsplit: ClassVar[str] = "test"
+    family: ClassVar[str] = "deepmind"
+
+    def open(self, path: Path, options: Options) -> ForeignDataset:
+        dataset = super().open(path, options)
+        renamed = (
+            f"{files[0].name} becomes the {split} split."
+            for split, files in self.files(path).items()
+            if len(files) == 1 and split not in (files[0].stem, files[0].parent.name)
+        )
+        family = f"Particle types have the meaning of the {options.family or self.family} family."
+        return replace(dataset, notes=(family, *dataset.notes, *renamed))
+
+
+def open_divided(
+    runs: Mapping[str, Sequence[SomeRun]],
+    facts: Facts,
+    read: Callable[[Sequence[SomeRun], Metadata], Iterator[Trajectory]],
+    options: Options,
+) -> ForeignDataset:
+    """The dataset of runs by split, of which those of the split "all" are divided by `divide`.
+
+    `read` gets metadata with the names of types that are in the files, also where the user gives other names.
+    """
+    metadata, unknown = facts.metadata, facts.unknown - options.settled
+    if options.family is not None and not facts.has_family:
+        family = find_family(options.family)
+        names, static, prescribed = dict(family.types), family.static, family.prescribed
+        metadata = replace(metadata, particle_types=names, static_types=static, prescribed_types=prescribed)
+        unknown -= {"particle_types", "static_types"}
+    metadata, undivided = options.apply_to(metadata), runs.get("all")
+    splits, divided = divide(undivided) if undivided else (runs, ())
+    in_files = replace(metadata, particle_types={**metadata.particle_types, **facts.metadata.particle_types})
+
+    def dataset(splits: Mapping[str, Sequence[SomeRun]], notes: tuple[str, ...]) -> ForeignDataset:
+        readers = {split: partial(read, each, in_files) for split, each in splits.items()}
+        counts = {split: len(each) for split, each in splits.items()}
+        return ForeignDataset(metadata, readers, notes, counts, facts.assumed, unknown, facts.steps)
+
+    whole = dataset({"train": undivided}, facts.notes) if undivided and divided == (_CUT,) else None
+    return replace(dataset(splits, (*facts.notes, *divided)), whole=whole)
+
+
+def divide(runs: Sequence[SomeRun]) -> tuple[dict[str, Sequence[SomeRun]], tuple[str, ...]]:
+    """Runs that no folder divides, by split; and notes on how they were divided."""
+    named = {split: [run for run in runs if run.split == split] for split in SPLITS}
+    if any(named.values()):
+        rest = [run for run in runs if run.split is None]
+        left_out = (f"{counted(len(rest), 'run')} in no split left out.",) if rest else ()
+        return {split: parts for split, parts in named.items() if parts}, left_out
+    if len(runs) > 2:
+        parts = split_runs(len(runs))
+        sizes = ", ".join(f"{len(part)} {split}" for split, part in parts.items())
+        note = f"Nothing divides the {len(runs)} runs: in their order {sizes}. Folders train, valid, test would."
+        return {split: [runs[index] for index in part] for split, part in parts.items()}, (note,)
+    if all(run.frames >= 10 * LEAST_FRAMES for run in runs):
+        return {split: [replace(run, part=split_runs(run.frames)[split]) for run in runs] for split in SPLITS}, (_CUT,)
+    return {"train": runs}, (f"{counted(len(runs), 'run')}, too few to divide: all for training.",)
+
+
+def cut(trajectory: Trajectory, part: range) -> Trajectory:
+    """Some consecutive frames of a trajectory, without particles that are in none of them."""
+    frames, particles = trajectory.position.shape[:2]
+    position = trajectory.position[part.start : part.stop]
+    keep = ~np.isnan(position[..., 0]).all(axis=0)
+    if len(part) == frames and (keep.all() or not keep.any()):
+        return trajectory
+
+    def cut_field(name: str, values: np.ndarray) -> np.ndarray:
+        if values.shape[:1] == (frames,) and not (name == ID and values.shape == (particles,)):
+            values = values[part.start : part.stop]
+            return values[:, keep] if values.shape[1:2] == (particles,) else values
+        return values[keep] if values.shape[:1] == (particles,) else values
+
+    fields = {name: cut_field(name, values) for name, values in trajectory.fields.items()}
+    return Trajectory(position[:, keep], trajectory.particle_type[keep], trajectory.attributes, fields)
+
+
+def split_runs(count: int) -> dict[str, range]:
+    """The last tenth (at least one) of more than two runs for tests, the tenth before to validate, others to train."""
+    tenth = max(1, count // 10) if count > 2 else 0
+    edges = (0, count - 2 * tenth, count - tenth, count)
+    return {split: range(low, high) for split, low, high in zip(SPLITS, edges, edges[1:], strict=False) if low < high}
 
 
 @contextmanager
@@ -248,6 +305,18 @@ def readable(where: Path | str, kind: str, *errors: type[Exception]) -> Iterator
         hint = "" if type(error) is ValueError else " Is it complete? Copy it again."
         reason = one_line(error) or type(error).__name__
         raise DataError(f"{where}: cannot be read as {kind} ({reason}).{hint}") from error
+
+
+def needs(path: Path, kind: str, package: str, extra: str, module: str | None = None) -> None:
+    """Checks that a path is a regular file, and that the package is installed that reads files of its kind.
+
+    Raises:
+        DataError: if there is no such file.
+        ConfigError: if the package, whose module may have another name, is missing.
+    """
+    check_regular(path)
+    if find_spec(module or package) is None:
+        raise ConfigError(f"{path}: reading {kind} needs {package}: {install(extra)}.")
 
 
 @contextmanager
@@ -265,8 +334,8 @@ def is_selected(file: Path, patterns: Sequence[str]) -> bool:
     return not patterns or any(lower.match(pattern.lower()) for pattern in patterns)
 
 
-def split_files(path: Path, *patterns: str, unsplit: str = "test") -> dict[str, tuple[Path, ...]]:
-    """The files of each split, ordered by the numbers in their names; see `FileFormat`.
+def split_files(path: Path, *patterns: str, unsplit: str) -> dict[str, tuple[Path, ...]]:
+    """The files of each split, ordered by the numbers in their names; see the module.
 
     Names such as "val" mean a split too. Files that are in none are those of `unsplit`.
     """
@@ -301,17 +370,3 @@ def find_split_name(*words: str) -> str | None:
     """The split that one of some words means, such as "val" or "training"; None if none does."""
     lower = [word.lower() for word in words]
     return next((split for split in SPLITS if {split, *OTHER_NAMES[split]} & set(lower)), None)
-
-
-def split_runs(count: int) -> dict[str, range]:
-    """Splits runs that nobody has split: the last tenth (at least one) for tests, the tenth before to validate.
-
-    One or two runs are all for training.
-    """
-    tenth = max(1, count // 10) if count > 2 else 0
-    parts = {
-        "train": range(count - 2 * tenth),
-        "valid": range(count - 2 * tenth, count - tenth),
-        "test": range(count - tenth, count),
-    }
-    return {split: part for split, part in parts.items() if part}

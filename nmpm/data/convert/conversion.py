@@ -1,11 +1,13 @@
-"""Streams opened datasets into the native layout, and renumbers particle types on the way."""
+"""Streams opened datasets into the native layout, or into files for other programs, and renumbers particle types."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
-from functools import partial
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import h5py
@@ -14,10 +16,12 @@ import numpy as np
 from nmpm._support.atomic import new_folder
 from nmpm._support.progress import progress_bar
 from nmpm.data.array_checks import check_end, swapped_axes
-from nmpm.data.convert.base import AXES, UNKNOWN_LENGTH, ForeignDataset
-from nmpm.data.facts import FOUND, FactFinder
-from nmpm.data.format import Metadata, Split, Trajectory, write_metadata, write_split
-from nmpm.data.split_files import SPLITS
+from nmpm.data.convert import native_folder, open_dataset
+from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset, Options
+from nmpm.data.facts import FactFinder
+from nmpm.data.format import SPLITS, Metadata, Split, Trajectory, write_metadata, write_split
+from nmpm.data.metadata import FOUND
+from nmpm.data.stated import AXES
 from nmpm.data.statistics import (
     STATISTICS_KEYS,
     Extent,
@@ -28,6 +32,8 @@ from nmpm.data.statistics import (
     notes_on_lengths,
     notes_on_rounding,
 )
+from nmpm.data.write import find_writer, write_trajectory
+from nmpm.data.write.base import Clip, TrajectoryWriter
 from nmpm.errors import ConfigError, DataError
 
 NOTES = "conversion"
@@ -63,8 +69,7 @@ def write_native(source: ForeignDataset, destination: Path, problems: list[str] 
 
 def _write(source: ForeignDataset, folder: Path, problems: list[str] | None) -> tuple[str, ...]:
     names = [name for name in SPLITS if name in source.splits]
-    counts = [source.counts.get(name) for name in names]
-    total = None if None in counts else sum(count or 0 for count in counts)
+    total = sum(source.counts.get(name, 0) for name in names) or None
     log = _Log(source, problems)
     with progress_bar("Converting", total) as advance:
         for name in names:
@@ -231,8 +236,7 @@ def renumber_types(source: ForeignDataset, ids: Mapping[int, int]) -> ForeignDat
     if unknown and "particle_types" not in source.unknown:
         names = ", ".join(f"{i} {name}" for i, name in sorted(metadata.particle_types.items()))
         raise ConfigError(f"There is no particle type {', '.join(map(str, unknown))}; known: {names}.")
-    # A type whose id is requested for another and that is not renumbered itself is dropped; `_renumber` checks that it
-    # does not occur.
+    # A type whose id is requested for another and that is not renumbered itself is dropped; it must not occur.
     dropped = frozenset(ids.values()) - frozenset(ids)
     kept = {i: name for i, name in metadata.particle_types.items() if i not in dropped}
     types = {ids.get(i, i): name for i, name in kept.items()}
@@ -240,17 +244,8 @@ def renumber_types(source: ForeignDataset, ids: Mapping[int, int]) -> ForeignDat
         raise ConfigError(f"{dict(ids)} gives two particle types the same id.")
     static = frozenset(ids.get(i, i) for i in metadata.static_types if i not in dropped)
     prescribed = frozenset(ids.get(i, i) for i in metadata.prescribed_types if i not in dropped)
-    return replace(
-        source,
-        metadata=replace(metadata, particle_types=types, static_types=static, prescribed_types=prescribed),
-        splits={name: partial(_renumber, start, ids, dropped) for name, start in source.splits.items()},
-    )
 
-
-def _renumber(
-    start: Callable[[], Iterator[Trajectory]], ids: Mapping[int, int], dropped: frozenset[int]
-) -> Iterator[Trajectory]:
-    for trajectory in start():
+    def renumber(trajectory: Trajectory) -> Trajectory:
         old = trajectory.particle_type
         if occurring := sorted(dropped.intersection(np.unique(old).tolist())):
             raise ConfigError(
@@ -259,4 +254,85 @@ def _renumber(
         new = old.copy()
         for before, after in ids.items():
             new[old == before] = after
-        yield replace(trajectory, particle_type=new)
+        return replace(trajectory, particle_type=new)
+
+    renumbered = replace(metadata, particle_types=types, static_types=static, prescribed_types=prescribed)
+    return source.map(renumber, renumbered)
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What an export wrote: a file to open, or a folder of so many of them, and notes for the user."""
+
+    path: Path
+    files: int
+    notes: tuple[str, ...]
+
+
+@contextmanager
+def open_complete(path: Path, format_name: str | None, options: Options) -> Iterator[ForeignDataset]:
+    """As `open_dataset`, with runs whole; facts that are to be found in them are found by converting them first."""
+    dataset = open_dataset(path, format_name, options)
+    if dataset.whole is not None:
+        with TemporaryDirectory() as temporary:
+            notes = write_native(dataset.whole, Path(temporary) / "whole")
+            yield replace(open_dataset(Path(temporary) / "whole"), notes=notes)
+    elif dataset.unknown:
+        native = open_dataset(native_folder(path, options, format_name))
+        yield replace(native, notes=tuple(native.metadata.extra.get(NOTES, ())))
+    else:
+        yield dataset
+
+
+def export(dataset: ForeignDataset, destination: Path, split: str | None, index: int | None) -> Exported:
+    """Writes one trajectory to a file, or all into a folder with the file's name but its suffix.
+
+    Args:
+        dataset: With all facts.
+        destination: Its suffix states the form.
+        split: All splits when left out; with an index, the tests or else the first.
+        index: Of the trajectory; all when left out.
+
+    Raises:
+        ConfigError: if there is no such form, split or trajectory.
+        DataError: if a trajectory cannot be read, or the folder exists.
+    """
+    writer, splits = find_writer("DESTINATION", destination), list(dataset.splits)
+    if split is not None and split not in splits:
+        raise ConfigError(f"--split {split}: the dataset has {', '.join(splits)}.")
+    if split is None and index is not None:
+        split = "test" if "test" in splits else splits[0]
+    chosen = splits if split is None else [split]
+    counts = {name: dataset.counts[name] for name in chosen}
+    if index is None and sum(counts.values()) != 1:
+        return _export_all(dataset, destination, writer, counts)
+    index, name = index or 0, chosen[0]
+    if index >= counts[name]:
+        raise ConfigError(f"--trajectory {index}: the {name} split has trajectories 0 … {counts[name] - 1}.")
+    trajectory = next(islice(dataset.splits[name](), index, None))
+    return Exported(write_trajectory(destination, trajectory, dataset.metadata), 1, _notes(writer.left_out(trajectory)))
+
+
+def _export_all(
+    dataset: ForeignDataset, destination: Path, writer: TrajectoryWriter, counts: dict[str, int]
+) -> Exported:
+    folder, left_out, total = destination.with_suffix(""), set[str](), sum(counts.values())
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DataError(
+            f"{folder}: exists already; {total} trajectories would become files in it. Choose another name, or one"
+            " trajectory by --trajectory N."
+        )
+    with new_folder(folder) as new, progress_bar("Writing", total) as step:
+        for name in counts:
+            (new / name).mkdir()
+            for index, trajectory in enumerate(dataset.splits[name]()):
+                writer.write(new / name / f"{index:05d}{destination.suffix}", Clip(trajectory, dataset.metadata))
+                left_out |= writer.left_out(trajectory)
+                step()
+    return Exported(folder, total, _notes(left_out))
+
+
+def _notes(left_out: set[str]) -> tuple[str, ...]:
+    if not left_out:
+        return ()
+    return (f"Not numbers of particles, so left out: {', '.join(sorted(left_out))}; .npz and .h5 hold all fields.",)

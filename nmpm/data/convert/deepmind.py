@@ -3,38 +3,216 @@
 Sanchez-Gonzalez et al., "Learning to simulate complex physics with graph networks", 2020. A record is one trajectory:
 context features `particle_type` (N int64 in one string) and `key`, and per frame `position` (N·D float32 in one
 string), in some datasets with further lists such as `step_context` or `force`.
+
+A record of a TFRecord file is its length (uint64), the length's checksum (uint32), the payload and the payload's
+checksum, little endian. Checksums are CRC-32C (RFC 3720, appendix B.4), rotated and shifted. A
+payload is a protocol buffer, a `tf.train.SequenceExample`; of its wire format only the parts that
+`tensorflow/core/example/example.proto` uses are supported.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from nmpm.data.convert.base import FileFormat, Options, located
-from nmpm.data.convert.tfrecord import Feature, SequenceExample, read_record, record_offsets
+from nmpm._support.bounded_files import check_regular
+from nmpm.data.convert.base import DescribedFiles, Facts, Options, Run, located
 from nmpm.data.format import METADATA_FILE, Metadata, Trajectory, read_metadata
 from nmpm.errors import DataError
 
+_BYTES, _FLOATS, _INTEGERS = 1, 2, 3  # fields of `Feature`
 
-class DeepMind(FileFormat):
+Feature = list[bytes] | NDArray[np.float32] | NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class SequenceExample:
+    """One record."""
+
+    context: dict[str, Feature]  # features of the whole sequence, by name
+    steps: dict[str, list[Feature]]  # for each name, a feature per time step
+
+
+def record_offsets(path: Path) -> list[int]:
+    """Byte offsets of a file's records; raises a DataError if it is empty or cut off, or a length is damaged."""
+    check_regular(path)
+    size = path.stat().st_size
+    offsets: list[int] = []
+    with path.open("rb") as file:
+        while (offset := file.tell()) < size:
+            length = _length(file, path, len(offsets), offset)
+            if offset + 12 + length + 4 > size:
+                raise _damage_error(path, len(offsets), offset, "the file ends within it")
+            offsets.append(offset)
+            file.seek(length + 4, 1)
+    if not offsets:
+        raise DataError(f"{path}: the file has no record.")
+    return offsets
+
+
+def read_record(path: Path, offset: int, index: int) -> SequenceExample:
+    """Reads the record at one of `record_offsets`; a DataError names its index if it is damaged."""
+    with path.open("rb") as file:
+        file.seek(offset)
+        payload = file.read(_length(file, path, index, offset))
+        checksum = file.read(4)
+    if struct.pack("<I", masked_crc(payload)) != checksum:
+        raise _damage_error(path, index, offset, "its checksum does not match its content")
+    try:
+        return _sequence_example(payload)
+    except (ValueError, IndexError, MemoryError) as error:
+        raise _damage_error(path, index, offset, f"it is not a tf.train.SequenceExample ({error})") from error
+
+
+def masked_crc(data: bytes) -> int:
+    """TFRecord's checksum of some bytes."""
+    crc = crc32c(data)
+    return (((crc >> 15) | (crc << 17)) + 0xA282EAD8) & 0xFFFFFFFF
+
+
+def crc32c(data: bytes) -> int:
+    """CRC-32C (Castagnoli)."""
+    return _compiled_crc32c()(np.frombuffer(data, np.uint8))
+
+
+@cache
+def _compiled_crc32c() -> Callable[[NDArray[np.uint8]], int]:
+    from nmpm._support.jit import jit  # takes half a second to import
+
+    table = np.arange(256, dtype=np.uint32)
+    for _ in range(8):
+        table = np.where(table & 1, np.uint32(0x82F63B78) ^ (table >> 1), table >> 1).astype(np.uint32)
+
+    @jit
+    def remainder(data: NDArray[np.uint8], table: NDArray[np.uint32]) -> np.uint32:
+        crc = np.uint32(0xFFFFFFFF)
+        for byte in data:
+            crc = table[(crc ^ byte) & np.uint32(0xFF)] ^ (crc >> np.uint32(8))
+        return crc
+
+    return lambda data: int(remainder(data, table)) ^ 0xFFFFFFFF
+
+
+def _length(file: BinaryIO, path: Path, index: int, offset: int) -> int:
+    """Reads a record's header; what it says is checked against the file's size by `record_offsets`."""
+    header = file.read(12)
+    if len(header) < 12:
+        raise _damage_error(path, index, offset, "the file ends within its header")
+    length, checksum = struct.unpack("<QI", header)
+    if masked_crc(header[:8]) != checksum:
+        raise _damage_error(path, index, offset, "the checksum of its length does not match")
+    return int(length)
+
+
+def _damage_error(path: Path, index: int, offset: int, why: str) -> DataError:
+    return DataError(
+        f"{path}: record {index}, at byte {offset}, cannot be read: {why}. Is it a complete TFRecord? Copy or"
+        " download it again."
+    )
+
+
+def _sequence_example(payload: bytes) -> SequenceExample:
+    context: dict[str, Feature] = {}
+    steps: dict[str, list[Feature]] = {}
+    for number, value in _fields(payload):
+        for inner, entry in _fields(_bytes(value)):
+            if inner != 1:
+                continue
+            parts = dict(_fields(_bytes(entry)))  # key and value of a map's entry
+            name, content = _bytes(parts.get(1, b"")).decode("utf-8"), _bytes(parts.get(2, b""))
+            if number == 1:
+                context[name] = _feature(content)
+            elif number == 2:
+                steps[name] = [_feature(_bytes(step)) for field, step in _fields(content) if field == 1]
+    return SequenceExample(context, steps)
+
+
+def _feature(message: bytes) -> Feature:
+    for kind, content in _fields(message):
+        values = [value for number, value in _fields(_bytes(content)) if number == 1]
+        if kind == _BYTES:
+            return [_bytes(value) for value in values]
+        if kind == _FLOATS:
+            return np.frombuffer(b"".join(map(_bytes, values)), "<f4")
+        if kind == _INTEGERS:
+            return np.array([number for value in values for number in _integers(value)], np.uint64).astype(np.int64)
+    return []
+
+
+def _integers(value: int | bytes) -> Iterator[int]:
+    """Yields one integer, or several packed into bytes; 64 bits in two's complement."""
+    position = 0
+    while isinstance(value, bytes) and position < len(value):
+        number, position = _varint(value, position)
+        yield number
+    if isinstance(value, int):
+        yield value
+
+
+def _fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
+    """Yields number and value of each field: an integer, or bytes where it has a length or a fixed width."""
+    position = 0
+    while position < len(message):
+        key, position = _varint(message, position)
+        number, wire = key >> 3, key & 7
+        if wire == 0:
+            integer, position = _varint(message, position)
+            yield number, integer
+            continue
+        if wire == 2:
+            width, position = _varint(message, position)
+        elif wire in (1, 5):
+            width = 8 if wire == 1 else 4
+        else:
+            raise ValueError(f"wire type {wire}")
+        if position + width > len(message):
+            raise ValueError("a field reaches beyond its message")
+        yield number, message[position : position + width]
+        position += width
+
+
+def _varint(message: bytes, position: int) -> tuple[int, int]:
+    """An integer of at most 64 bits, and the position after it."""
+    value = shift = 0
+    while True:
+        byte = message[position]
+        value |= (byte & 0x7F) << shift
+        position, shift = position + 1, shift + 7
+        if byte < 0x80:
+            return value & 0xFFFFFFFFFFFFFFFF, position
+        if shift > 63:
+            raise ValueError("a varint that is too long")
+
+
+def _bytes(value: int | bytes) -> bytes:
+    if not isinstance(value, bytes):
+        raise ValueError("an integer instead of bytes")
+    return value
+
+
+class DeepMind(DescribedFiles):
     """TFRecord files with a `metadata.json` beside them."""
 
-    name: ClassVar[str] = "deepmind"
     summary: ClassVar[str] = "DeepMind's TFRecord files with metadata.json (Learning to Simulate)"
-    pattern: ClassVar[str] = "*.tfrecord"
+    patterns: tuple[str, ...] = ("*.tfrecord",)
 
-    def metadata(self, file: Path, options: Options) -> tuple[Metadata, tuple[str, ...]]:
-        return read_metadata(file.parent, options.family or self.family), ()
+    def facts(self, file: Path, options: Options) -> Facts:
+        return Facts(read_metadata(file.parent, options.family or self.family), has_family=True)
 
-    def count(self, file: Path) -> int:
-        return len(record_offsets(file))
+    def runs(self, file: Path) -> Sequence[Run]:
+        return [Run(file, index) for index in range(len(record_offsets(file)))]
 
-    def read(self, file: Path, metadata: Metadata, options: Options) -> Iterator[Trajectory]:  # noqa: ARG002
-        for index, offset in enumerate(record_offsets(file)):
-            yield _trajectory(read_record(file, offset, index), metadata.dim, f"{file}: record {index}")
+    def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:
+        offsets = record_offsets(file)
+        for index in indices:
+            yield _trajectory(read_record(file, offsets[index], index), metadata.dim, f"{file}: record {index}")
 
 
 def _trajectory(example: SequenceExample, dim: int, where: str) -> Trajectory:

@@ -9,18 +9,18 @@ A file is one trajectory: a MessagePack array of maps with `pos` and `vel` (N, D
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from nmpm._support.bounded_files import EXPANSION, check_regular, expansion_limit
-from nmpm._support.memory import check_fits
+from nmpm._support.machine import check_fits
 from nmpm._support.messages import install, one_line
-from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options, located, readable
+from nmpm.data.convert.base import UNKNOWN_LENGTH, DescribedFiles, Facts, Options, located, readable
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.metadata import find_family
+from nmpm.data.stated import find_family
 from nmpm.data.statistics import extent_of
 from nmpm.errors import ConfigError, DataError
 
@@ -31,16 +31,14 @@ _ITEMS = 256  # of a list or map
 _KIND = re.compile(rb"[<>|=]?[biuf]\d{1,2}")
 
 
-class Dmcf(FileFormat):
+class Dmcf(DescribedFiles):
     """A file per trajectory; particle type 0 is the fluid, type 1 the solid boundary."""
 
-    name: ClassVar[str] = "dmcf"
     summary: ClassVar[str] = "DMCF's *.msgpack.zst files (extra convert)"
-    pattern: ClassVar[str] = "*.msgpack.zst"
+    patterns: tuple[str, ...] = ("*.msgpack.zst",)
     family: ClassVar[str] = "lagrangebench"
-    assumed: ClassVar[frozenset[str]] = frozenset({"dt", "gravity"})
 
-    def metadata(self, file: Path, options: Options) -> tuple[Metadata, tuple[str, ...]]:
+    def facts(self, file: Path, options: Options) -> Facts:
         first = next(_frames(file), {})
         position = _array(first, "pos", f"{file}, frame 0")
         dim = position.shape[1]
@@ -59,9 +57,9 @@ class Dmcf(FileFormat):
             *(() if options.dt else (f"The files do not state dt; {_DT:g} s is assumed (--dt).",)),
             *(() if options.gravity else (f"The files do not state gravity; {_GRAVITY:g} along y is assumed.",)),
         )
-        return metadata, notes
+        return Facts(metadata, notes=notes, assumed=frozenset({"dt", "gravity"}), has_family=True)
 
-    def read(self, file: Path, metadata: Metadata, options: Options) -> Iterator[Trajectory]:  # noqa: ARG002
+    def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:  # noqa: ARG002
         frames = list(_frames(file))
         if not frames:
             raise DataError(f"{file}: the file has no frame.")

@@ -8,6 +8,8 @@ A reader is one subclass of `FrameFormat` with a function that yields the frames
     data/train/run00.lammpstrj         splits of files with many frames
 
 Frames are in the order of the last numbers in their files' names, runs in the order of all numbers in theirs.
+
+Of a folder's kinds of files, those of particles are read; boundary particles and surfaces are told by their names.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ import abc
 import fnmatch
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice, repeat
@@ -25,34 +27,145 @@ from typing import ClassVar
 
 import numpy as np
 
+from nmpm._support.bounded_files import starts_with
 from nmpm._support.messages import counted
 from nmpm._support.progress import progress_bar
 from nmpm.data.convert.base import (
     ANY_NAME,
-    DatasetFormat,
+    EVERYTHING_UNKNOWN,
+    Facts,
     ForeignDataset,
     Options,
+    Reader,
+    Run,
     find_split_name,
     is_selected,
     number_order,
+    open_divided,
+    placeholder_metadata,
 )
-from nmpm.data.convert.file_kinds import (
-    NUMBER,
-    Kinds,
-    by_kind,
-    choose_particles,
-    keep_particles,
-    material_names,
-    other_folders,
-    stem,
-)
-from nmpm.data.convert.frame import Frame, Layout, ParticleArrays, flat_axes, join_frames
-from nmpm.data.convert.frame_stack import FrameStack
-from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Run, open_divided, placeholder_metadata
-from nmpm.data.convert.text_lines import starts_with
-from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.split_files import SPLITS, is_no_data
+from nmpm.data.convert.frames import Frame, FrameArrays, FrameLayout, FrameStack, flat_axes, join_frames
+from nmpm.data.format import SPLITS, Metadata, Trajectory, is_no_data
 from nmpm.errors import DataError
+
+NUMBER = re.compile(r"\d{1,18}(?!.*\d)")
+"""The last number of a name: that of the frame."""
+
+WALL = "wall"
+"""Name of the material of boundary particles."""
+
+_WALL_WORDS = frozenset({"bound", "boundary", "boundaries", "wall", "walls"})
+_OTHER_WORDS = frozenset(
+    {
+        "bbox", "bond", "bonds", "bounding", "box", "cell", "cells", "chain", "chains", "contact", "contacts",
+        "container", "domain", "facet", "facets", "force", "forces", "geometry", "grid", "grids", "interaction",
+        "interactions", "intr", "intrs", "isosurface", "mesh", "meshes", "node", "nodes", "obstacle", "obstacles",
+        "pair", "pairs", "rb", "rigid", "stl", "surface", "surfaces",
+    }
+)  # fmt: skip
+
+Kinds = Mapping[str, Sequence[Path]]
+"""Files by their names, in which * replaces the last number."""
+
+
+def by_kind(files: Iterable[Path]) -> dict[str, list[Path]]:
+    """Files whose names differ in their last number only, in the order of the numbers."""
+    kinds: dict[str, list[Path]] = {}
+    for file in sorted(files, key=number_order):
+        kinds.setdefault(NUMBER.sub("*", stem(file)) + file.name[len(stem(file)) :], []).append(file)
+    return kinds
+
+
+def stem(file: Path) -> str:
+    """A name without its suffixes, such as `.vtk` or `.lammpstrj.gz`; that of `dump.500` is whole."""
+    return re.sub(r"(\.[A-Za-z]\w*){1,2}$", "", file.name)
+
+
+def choose_particles(folder: Path, kinds: Kinds, problem: Callable[[Path], str]) -> tuple[Kinds, str]:
+    """The files of particles and of boundary particles, by material, and a note on the others.
+
+    Args:
+        folder: Of the files.
+        kinds: All files of the format in it.
+        problem: Says why a file has no particles; empty if it has.
+
+    Raises:
+        DataError: if more than one kind may be the particles, or none.
+    """
+    problems = {kind: problem(files[0]) for kind, files in kinds.items()}
+    walls = [kind for kind in kinds if words(kind) & _WALL_WORDS and not problems[kind]]
+    points = [kind for kind in kinds if kind not in walls and not problems[kind]]
+    particles = [kind for kind in points if not words(kind) & _OTHER_WORDS] or points
+    series = [kind for kind in particles if len(kinds[kind]) > 1]
+    particles = series if len(particles) > 1 and series else particles
+    if not particles and len(walls) == 1:
+        particles, walls = walls, []
+    if len(particles) != 1:
+        raise DataError(f"{folder}: {_which(kinds, particles, problems)}")
+    names = {particles[0]: "", **dict.fromkeys(walls, WALL)}
+    others = [f"{kind} ({problems[kind] or 'another kind of file'})" for kind in kinds if kind not in names]
+    joined = f" with the boundary particles of {', '.join(walls)}" if walls else ""
+    left_out = f" left out: {', '.join(others)};" if others else ""
+    note = f"{folder}: the particles are {particles[0]}{joined};{left_out} others are read by --files PATTERN."
+    return {kind: kinds[kind] for kind in names}, note
+
+
+def keep_particles(folder: Path, kinds: Kinds) -> tuple[Kinds, str]:
+    """The lists of frames but for those that are called as walls, surfaces and the like are, and a note on these."""
+    particles = {kind: files for kind, files in kinds.items() if not _only_others(kind)}
+    others = ", ".join(kind for kind in kinds if kind not in particles)
+    if not particles or not others:
+        return kinds, ""
+    return particles, f"{folder}: left out by their names: {others}; --files PATTERN reads them."
+
+
+def other_folders(path: Path, folders: Mapping[Path, Sequence[Path]]) -> list[Path]:
+    """Folders that are called as those of grids and surfaces are, with files whose names no other folder has."""
+    others = [folder for folder in folders if folder != path and _only_others(folder.name)]
+    kinds = {kind for folder, files in folders.items() if folder not in others for kind in by_kind(files)}
+    return [folder for folder in others if kinds and not kinds & by_kind(folders[folder]).keys()]
+
+
+def _only_others(name: str) -> bool:
+    return bool(words(name)) and words(name) <= _OTHER_WORDS | _WALL_WORDS | {"bodies"}
+
+
+def is_other_name(name: str) -> bool:
+    """Whether a word of a name is one of grids, surfaces and the like."""
+    return bool(words(name) & _OTHER_WORDS)
+
+
+def material_names(kinds: Iterable[str]) -> dict[str, str]:
+    """Names of materials by kinds: what tells their names from each other; all walls are called so."""
+    kinds = list(kinds)
+    ordered = {kind: [word.lower() for word in _words(Path(kind).stem)] for kind in kinds}
+    shared = set.intersection(*map(set, ordered.values())) if len(kinds) > 1 else set[str]()
+    names = {kind: "_".join(word for word in ordered[kind] if word not in shared) or "particles" for kind in kinds}
+    names = {kind: WALL if words(kind) & _WALL_WORDS else name for kind, name in names.items()}
+    repeated = len({name for name in names.values() if name != WALL}) < sum(name != WALL for name in names.values())
+    return {kind: kind if repeated and name != WALL else name for kind, name in names.items()}
+
+
+def words(name: str) -> set[str]:
+    """The words of a name, without its suffix, in lower case."""
+    return {word.lower() for word in _words(re.sub(r"\.[A-Za-z]\w*$", "", name))}
+
+
+def _words(text: str) -> list[str]:
+    return re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", text)
+
+
+def _which(kinds: Kinds, particles: Sequence[str], problems: Mapping[str, str]) -> str:
+    shown = ", ".join(f"{kind} ({len(kinds[kind])})" for kind in list(particles or kinds)[:6])
+    if not particles:
+        return f"no file in it has particles: {', '.join(f'{kind} ({problems[kind]})' for kind in list(kinds)[:4])}."
+    first, *_ = particles
+    return (
+        f"files of {len(particles)} kinds may be the particles: {shown}. State which: --files '{first}'; kinds that"
+        f" you list, as in --files '{','.join(particles[:2])}', join as materials. (nmpm fit: --data.files.) If each"
+        " kind is a run, give it a folder of its own."
+    )
+
 
 _DEPTH = 3  # of folders
 _FIRST_FRAMES = 10  # of a file with many, from which the layout is taken
@@ -73,16 +186,14 @@ class FrameRun(Run):
         return tuple(file for file in self.files if file is not None)
 
 
-class FrameFormat(DatasetFormat):
+class FrameFormat(Reader):
     """Abstract reader of a format whose files contain one frame, or many, one subclass per format.
 
     Attributes:
         listings: Of the names of files that list the frames of a run; where there is one, others are only read by it.
-        signature: Bytes that files begin with, by which they are recognised where their names have no usual suffix.
     """
 
     listings: ClassVar[tuple[str, ...]] = ()
-    signature: ClassVar[bytes] = b""
 
     @abc.abstractmethod
     def frames(self, file: Path) -> Iterator[Frame]:
@@ -103,7 +214,7 @@ class FrameFormat(DatasetFormat):
         runs, gaps = self._runs(path)
         run = next((run for split in SPLITS for run in runs if run.split == split), runs[0])
         first = self._first_frames(run)
-        layout, type_ids = Layout.of(first), self._type_ids(first, runs)
+        layout, type_ids = FrameLayout.of(first), self._type_ids(first, runs)
         stated = {"bounds": first[0].box, "boundary": first[0].boundary}
         facts = {
             name: tuple(value[axis] for axis in layout.axes) for name, value in stated.items() if value is not None
@@ -111,10 +222,9 @@ class FrameFormat(DatasetFormat):
         names = {number: name for name, number in type_ids.items()}
         metadata = placeholder_metadata(len(layout.axes), particle_types=names, **facts)
         notes = (*layout.notes(), *gaps, *self.notes(first, options))
-        read = partial(self._read_all, layout=layout)
-        dataset = open_divided({"all": runs}, (metadata, EVERYTHING_UNKNOWN - set(facts), notes), read, options)
         steps = first[0].time is None and first[0].step is not None
-        return replace(dataset, steps=steps, whole=dataset.whole and replace(dataset.whole, steps=steps))
+        stated_facts = Facts(metadata, EVERYTHING_UNKNOWN - set(facts), notes, steps=steps)
+        return open_divided({"all": runs}, stated_facts, partial(self._read_all, layout=layout), options)
 
     def _folders(self, path: Path) -> Iterator[tuple[Path, list[Path]]]:
         """Yields folders with files of this format and these files; of a file its own."""
@@ -213,7 +323,7 @@ class FrameFormat(DatasetFormat):
         """Type ids by the names in the first frame of all runs, where types have names; those of the files, or new."""
 
         def ids(frame: Frame) -> dict[str, int]:
-            arrays = ParticleArrays.of(frame, range(frame.position.shape[1]), None)
+            arrays = FrameArrays.of(frame, range(frame.position.shape[1]), None)
             names = [] if arrays.type_names is None else arrays.type_names.tolist()
             return dict(zip(names, repeat(-1) if arrays.type is None else arrays.type.tolist(), strict=False))
 
@@ -226,7 +336,7 @@ class FrameFormat(DatasetFormat):
             return {name: number for number, name in enumerate(sorted(named))}
         return named if len(set(named.values())) == len(named) else {}
 
-    def _read_all(self, runs: Sequence[FrameRun], metadata: Metadata, layout: Layout) -> Iterator[Trajectory]:
+    def _read_all(self, runs: Sequence[FrameRun], metadata: Metadata, layout: FrameLayout) -> Iterator[Trajectory]:
         ids = {name: number for number, name in metadata.particle_types.items()}
         for run in runs:
             total = (run.frames if run.part is None else len(run.part)) or None

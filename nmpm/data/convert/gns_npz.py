@@ -8,7 +8,7 @@ per trajectory. NumPy stores objects as a pickle, which is read by the restricte
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,44 +16,47 @@ import numpy as np
 
 from nmpm._support.messages import one_line
 from nmpm.data.convert.array_files import NpzArray, npz_members
-from nmpm.data.convert.base import FileFormat, Options, located
-from nmpm.data.convert.restricted_pickle import load_pickled, number_array
+from nmpm.data.convert.base import DescribedFiles, Facts, Options, Run, located
+from nmpm.data.convert.pickles import load_pickled, number_array
 from nmpm.data.format import METADATA_FILE, Metadata, Trajectory, read_metadata
 from nmpm.errors import DataError
 
 _ALL = "gns_data"
 
 
-class GnsNpz(FileFormat):
+class GnsNpz(DescribedFiles):
     """NumPy files with a `metadata.json` beside them."""
 
-    name: ClassVar[str] = "gns-npz"
     summary: ClassVar[str] = "NumPy files of geoelements/gns with metadata.json"
-    pattern: ClassVar[str] = "*.npz"
+    patterns: tuple[str, ...] = ("*.npz",)
 
     def recognises(self, path: Path) -> bool:
         return super().recognises(path) and ((path if path.is_dir() else path.parent) / METADATA_FILE).is_file()
 
-    def metadata(self, file: Path, options: Options) -> tuple[Metadata, tuple[str, ...]]:
-        return read_metadata(file.parent, options.family or self.family), ()
+    def facts(self, file: Path, options: Options) -> Facts:
+        return Facts(read_metadata(file.parent, options.family or self.family), has_family=True)
 
-    def count(self, file: Path) -> int | None:
-        names = npz_members(file)
-        return None if names == (_ALL,) else len(names)
+    def runs(self, file: Path) -> Sequence[Run]:
+        return [Run(file, index) for index in range(sum(count for _, _, count in _members(file)))]
 
-    def read(self, file: Path, metadata: Metadata, options: Options) -> Iterator[Trajectory]:  # noqa: ARG002
-        for name in npz_members(file):
-            where = f"{file}: {one_line(name, 60)}"
-            content = _array(file, name, where)
-            for row in content if name == _ALL else [content]:
+    def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:  # noqa: ARG002
+        for array, where, count in _members(file):
+            content: Any = load_pickled(array.pickled(), where) if array.dtype.hasobject else array[()]
+            rows = [content] if where != f"{file}: {_ALL}" else list(content) if getattr(content, "ndim", 0) else []
+            if len(rows) != count:
+                raise DataError(f"{where}: its header states {count} trajectories; it holds {len(rows)}.")
+            for row in rows:
                 yield _trajectory(row, where)
 
 
-def _array(path: Path, name: str, where: str) -> Any:
-    """The content of a member; objects are read by the restricted unpickler."""
-    with zipfile.ZipFile(path) as archive:
-        array = NpzArray(archive, name, where)
-        return load_pickled(array.pickled(), where) if array.dtype.hasobject else array[()]
+def _members(file: Path) -> Iterator[tuple[NpzArray, str, int]]:
+    """Yields each member, where it is, and its number of trajectories."""
+    names = npz_members(file)
+    with zipfile.ZipFile(file) as archive:
+        for name in names:
+            where = f"{file}: {one_line(name, 60)}"
+            array = NpzArray(archive, name, where)
+            yield array, where, (*array.shape, 0)[0] if name == _ALL else 1
 
 
 def _trajectory(row: Any, where: str) -> Trajectory:

@@ -13,8 +13,8 @@ from typing import Any, ClassVar
 import h5py
 import numpy as np
 
-from nmpm.data.convert.frame import Frame, join_frames, wrap
 from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.data.convert.frames import Frame, join_frames, wrap
 from nmpm.data.convert.named_arrays import as_text
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
 from nmpm.errors import DataError
@@ -26,7 +26,6 @@ _ALL = "all"
 class H5md(FrameFormat):
     """Files of many frames; particles are matched by `id`, where there is one."""
 
-    name: ClassVar[str] = "h5md"
     summary: ClassVar[str] = "H5MD (.h5, .h5md): particles/GROUP/position/value"
     patterns: tuple[str, ...] = ("*.h5md", "*.h5", "*.hdf5")
 

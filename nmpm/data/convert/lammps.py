@@ -16,11 +16,10 @@ import numpy as np
 
 from nmpm._support.messages import counted, one_line
 from nmpm.data.convert.base import Options
-from nmpm.data.convert.frame import Frame, wrap
-from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.data.convert.frames import Frame, wrap
 from nmpm.data.convert.named_arrays import AXES
-from nmpm.data.convert.text_lines import Lines, complete_frames, open_lines, parse_columns
-from nmpm.errors import DataError
+from nmpm.data.convert.tables import number_columns
+from nmpm.data.convert.text_frames import Lines, TextFrames, complete_frames, parse_columns
 from nmpm.scene import Boundary, Interval
 
 _log = logging.getLogger(__name__)
@@ -42,30 +41,48 @@ class _Header:
     columns: tuple[str, ...]
 
 
-class Lammps(FrameFormat):
+class Lammps(TextFrames):
     """LAMMPS text dumps; particles are sorted by id."""
 
-    name: ClassVar[str] = "lammps"
     summary: ClassVar[str] = "text dumps of LAMMPS and LIGGGHTS, by their content; also gzipped"
     patterns: tuple[str, ...] = ("*.lammpstrj", "*.lammpstrj.gz", "*.dump", "*.dump.gz", "dump.*")
     signature: ClassVar[bytes] = b"ITEM: "
+    kind: ClassVar[str] = "a LAMMPS dump"
 
     def frames(self, file: Path) -> Iterator[Frame]:
         before, repeated = None, 0
-        with open_lines(file, "a LAMMPS dump") as lines:
-            for header, block in _blocks(lines):
-                # A simulation that goes on writes the last frame of the one before again.
-                if header.step == before:
-                    repeated += 1
-                else:
-                    yield _frame(header, block, f"{file}, timestep {header.step}")
-                before = header.step
+        for frame in super().frames(file):
+            # A simulation that goes on writes the last frame of the one before again.
+            if frame.step == before:
+                repeated += 1
+            else:
+                yield frame
+            before = frame.step
         if repeated:
             _log.warning("%s: %s repeated the timestep before and left out.", file, counted(repeated, "frame"))
 
-    def count(self, file: Path) -> int:
-        with open_lines(file, "a LAMMPS dump") as lines:
-            return sum(1 for _ in _blocks(lines))
+    def blocks(self, lines: Lines) -> Iterator[tuple[str, _Header, bytes]]:
+        while (header := _header(lines)) is not None:
+            yield f"timestep {header.step}", header, lines.block(header.count, header.start)
+
+    def frame(self, header: _Header, block: bytes) -> Frame:
+        columns = parse_columns(block, header.columns)
+        end = next((end for end in _ENDS if "x" + end in columns and "y" + end in columns), None)
+        if end is None:
+            found = " ".join(header.columns)
+            raise ValueError(f"no columns x y, xs ys, xu yu or xsu ysu of coordinates (found: {found})")
+        position = number_columns(columns, [axis + end for axis in AXES if axis + end in columns])
+        box = header.box[: position.shape[1]]
+        if end.startswith("s"):
+            low, high = np.array(box).T
+            position = low + position * (high - low)
+        boundary: tuple[Boundary, ...] = tuple("periodic" if flag == "pp" else "wall" for flag in header.flags)
+        position = wrap(position, header.box, boundary)
+        others = {axis + end for axis in AXES for end in _ENDS}.union(_IMAGES)
+        arrays = {name: values for name, values in columns.items() if name not in others}
+        # Shrink-wrapped boxes (s, m) follow the particles: they state no bounds.
+        fixed = bool(header.flags) and not any(set(flag) & set("sm") for flag in header.flags[: len(box)])
+        return Frame(position, arrays, header.time, header.step, header.box if fixed else None, boundary or None)
 
     def notes(self, frames: Sequence[Frame], options: Options) -> tuple[str, ...]:
         steps = [frame.step for frame in frames if frame.step is not None]
@@ -73,12 +90,6 @@ class Lammps(FrameFormat):
             return ()
         apart = steps[1] - steps[0]
         return (f"Frames are {apart} steps of LAMMPS apart; if dt is not the time between them, state it: --dt.",)
-
-
-def _blocks(lines: Lines) -> Iterator[tuple[_Header, bytes]]:
-    """Yields the header and the lines of particles of each frame."""
-    while (header := _header(lines)) is not None:
-        yield header, lines.block(header.count, header.start)
 
 
 def _header(lines: Lines) -> _Header | None:
@@ -117,29 +128,3 @@ def _interval(line: str) -> Interval:
     if not np.isfinite([low, high]).all() or low > high:
         raise ValueError(f"the bounds {line} of its box are not ascending")
     return low, high
-
-
-def _frame(header: _Header, block: bytes, where: str) -> Frame:
-    try:
-        columns = parse_columns(block, header.columns)
-    except ValueError as error:
-        raise DataError(f"{where}: {one_line(error)}.") from error
-    end = next((end for end in _ENDS if "x" + end in columns and "y" + end in columns), None)
-    if end is None:
-        raise DataError(
-            f"{where}: no columns x y, xs ys, xu yu or xsu ysu of coordinates (found: {' '.join(header.columns)})."
-        )
-    names = [axis + end for axis in AXES if axis + end in columns]
-    position = np.stack([columns.pop(name) for name in names], axis=1)
-    if position.dtype.kind != "f":
-        raise DataError(f"{where}: the columns {' '.join(names)} must contain numbers.")
-    if end.startswith("s"):
-        low, high = np.array(header.box[: len(names)]).T
-        position = low + position * (high - low)
-    boundary: tuple[Boundary, ...] = tuple("periodic" if flag == "pp" else "wall" for flag in header.flags)
-    position = wrap(position, header.box, boundary)
-    others = {axis + end for axis in AXES for end in _ENDS}.union(_IMAGES)
-    arrays = {name: values for name, values in columns.items() if name not in others}
-    # Shrink-wrapped boxes (s, m) follow the particles: they state no bounds.
-    fixed = bool(header.flags) and not any(set(flag) & set("sm") for flag in header.flags[: len(names)])
-    return Frame(position, arrays, header.time, header.step, header.box if fixed else None, boundary or None)

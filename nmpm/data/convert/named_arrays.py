@@ -289,26 +289,21 @@ def find_roles(arrays: Arrays, position: str) -> dict[str, str]:
         "particle_volume": [(), (1,)],
     }
 
+    lists = {"type_names": "SUO", "static_types": "iu", "boundary": "SUO"}  # of any length, by their kinds
+
     def fits(meaning: str, array: ArrayLike) -> bool:
-        shape = tuple(array.shape)
-        if meaning in _LISTS:
-            return len(shape) == 1 and array.dtype.kind in _LISTS[meaning]
-        if array.dtype.kind not in "biuf" and meaning not in _TEXTS:
-            return False
-        return shape in shapes[meaning] or any(shape == (*runs, *one) for one in shapes[meaning])
+        shape, kind = tuple(array.shape), array.dtype.kind
+        if meaning in lists:
+            return len(shape) == 1 and kind in lists[meaning]
+        may_be_text = meaning in ("types", "active", "time", "id")
+        return (kind in "biuf" or may_be_text) and any(shape in (one, (*runs, *one)) for one in shapes[meaning])
 
     others = [name for name in arrays if name != position]
     roles = {"position": position}
-    for meaning in (*shapes, *_LISTS):
+    for meaning in (*shapes, *lists):
         fitting = [name for name in with_meaning(meaning, others) if fits(meaning, arrays[name])]
         roles |= {meaning: fitting[0]} if fitting else {}
     return roles
-
-
-_LISTS = {"type_names": "SUO", "static_types": "iu", "boundary": "SUO"}
-"""Kinds of the numbers or texts of facts that are lists of any length."""
-_TEXTS = ("types", "active", "time", "id")
-"""Meanings of arrays that may be of texts, or of dates."""
 
 
 def join_components(arrays: Arrays) -> Arrays:

@@ -16,7 +16,7 @@ from nmpm.data.convert.array_files import ArrayFiles, open_arrays
 from nmpm.data.convert.named_arrays import Arrays, can_be_positions, describe, transposition, with_meaning
 from nmpm.data.convert.tables import SUFFIXES
 from nmpm.data.convert.tracks import table_columns
-from nmpm.data.split_files import SPLITS, is_no_data
+from nmpm.data.format import is_no_data
 from nmpm.errors import NmpmError
 
 _PAGE = "docs/howto/your_data.md shows all forms."
@@ -148,17 +148,6 @@ def describe_several(path: Path, datasets: Sequence[Path]) -> str:
     more = f" and {len(datasets) - 8} more" if len(datasets) > 8 else ""
     several = f"several datasets, {names}{more}" if len(datasets) > 1 else f"a dataset, {names}"
     return f"{path}: the folder is not one dataset but holds {several}: name one of them, e.g. {datasets[0]}."
-
-
-def subfolders(path: Path) -> Iterator[Path]:
-    """The folders in a folder, in the order of their names; none in a file."""
-    inside = sorted(path.glob("*")) if path.is_dir() else ()
-    return (inner for inner in inside if inner.is_dir() and not is_no_data(inner.name))
-
-
-def has_splits(folder: Path) -> bool:
-    """Whether a folder has files or folders called train, valid or test, and is a dataset of its own."""
-    return folder.name not in SPLITS and any(inner.name.split(".")[0] in SPLITS for inner in folder.glob("*"))
 
 
 def _files(path: Path) -> Iterator[Path]:

@@ -7,7 +7,8 @@ the time between frames nor the walls: for the published datasets (Rochman-Shara
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import copy
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -15,11 +16,11 @@ from typing import ClassVar
 import h5py
 import numpy as np
 
-from nmpm._support.memory import check_fits
-from nmpm.data.convert.base import UNKNOWN_LENGTH, FileFormat, Options, located, split_files
+from nmpm._support.machine import check_fits
+from nmpm.data.convert.base import UNKNOWN_LENGTH, DescribedFiles, Facts, ForeignDataset, Options, located
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
-from nmpm.data.metadata import find_family
+from nmpm.data.stated import find_family
 from nmpm.data.statistics import extent_of, first_moving_particle
 from nmpm.errors import DataError
 from nmpm.scene import Interval
@@ -52,21 +53,30 @@ _PUBLISHED = {
 }
 
 
-class NeuralMpm(FileFormat):
-    """A folder with folders train, valid and test of `sim_*.h5` files, or one of these."""
+class NeuralMpm(DescribedFiles):
+    """A folder with folders train, valid and test of `sim_*.h5` files, or one of these.
 
-    name: ClassVar[str] = "neuralmpm"
+    Attributes:
+        material: Type id that the user states for the particles of files without types.
+    """
+
     summary: ClassVar[str] = "NeuralMPM's folders of sim_*.h5 files, also from the hub's iSach/NeuralMPM"
-    pattern: ClassVar[str] = "sim_*.h5"
+    patterns: tuple[str, ...] = ("sim_*.h5",)
+    material: int | None = None
 
     def recognises(self, path: Path) -> bool:
-        files = split_files(path, self.pattern)
+        files = self.files(path)
         try:
             return bool(files) and not {"particles", "boundary"}.isdisjoint(_names(next(iter(files.values()))[0]))
         except DataError:
             return True  # damaged
 
-    def metadata(self, file: Path, options: Options) -> tuple[Metadata, tuple[str, ...]]:
+    def open(self, path: Path, options: Options) -> ForeignDataset:
+        reader, materials = copy.copy(self), [i for i in options.types or {} if i != _BOUNDARY]
+        reader.material = materials[0] if len(materials) == 1 else None
+        return super(NeuralMpm, reader).open(path, options)
+
+    def facts(self, file: Path, options: Options) -> Facts:
         folder, published = file.resolve().parent.parent, _published(file)
         first = _trajectory(_content(file), published.material if published else None, file)
         if published is None and options.dt is None:
@@ -96,16 +106,13 @@ class NeuralMpm(FileFormat):
             notes.append("The boundary moves in the first trajectory.")
         if _GRAVITY in first.fields:
             notes.append("`grav` is kept as a field, and used as gravity in length/s² where it has D numbers.")
-        return metadata, tuple(notes)
+        return Facts(metadata, notes=tuple(notes), has_family=True)
 
-    def read(self, file: Path, metadata: Metadata, options: Options) -> Iterator[Trajectory]:  # noqa: ARG002
+    def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:  # noqa: ARG002
         published, content = _published(file), _content(file)
-        material = published.material if published else None
-        if published is None and "types" not in content:
-            stated = [i for i in options.types or {} if i != _BOUNDARY]
-            if len(stated) != 1:
-                raise DataError(f"{file}: it does not state the particles' material. State it: --types 5=water.")
-            material = stated[0]
+        material = published.material if published else self.material
+        if published is None and "types" not in content and material is None:
+            raise DataError(f"{file}: it does not state the particles' material. State it: --types 5=water.")
         yield _trajectory(content, material, file)
 
 

@@ -9,14 +9,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from nmpm._support.bounded_files import check_regular
-from nmpm._support.messages import install
-from nmpm.data.convert.base import readable
-from nmpm.data.convert.frame import Frame
+from nmpm.data.convert.base import needs, readable
 from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.data.convert.frames import Frame
 from nmpm.data.convert.named_arrays import AXES
-from nmpm.data.convert.text_lines import is_number
-from nmpm.errors import ConfigError, DataError
+from nmpm.data.convert.text_frames import is_number
+from nmpm.errors import DataError
 
 _TIME = re.compile(r"time\W+([-+.\deE]+)\s*$", re.IGNORECASE)
 
@@ -24,17 +22,14 @@ _TIME = re.compile(r"time\W+([-+.\deE]+)\s*$", re.IGNORECASE)
 class Ply(FrameFormat):
     """The element `vertex` of PLY files; a comment such as `time 0.5` states the time."""
 
-    name: ClassVar[str] = "ply"
     summary: ClassVar[str] = "PLY files of points, a file per frame (extra vtk)"
     patterns: tuple[str, ...] = ("*.ply",)
     signature: ClassVar[bytes] = b"ply"
 
     def frames(self, file: Path) -> Iterator[Frame]:
-        check_regular(file)
-        try:
-            import plyfile
-        except ImportError as error:
-            raise ConfigError(f"{file}: reading PLY needs plyfile: {install('vtk')}.") from error
+        needs(file, "PLY", "plyfile", "vtk")
+        import plyfile
+
         with readable(file, "PLY", plyfile.PlyParseError, LookupError, TypeError):
             _check_sizes(plyfile, file)
             content = plyfile.PlyData.read(str(file))

@@ -17,10 +17,16 @@ from scipy.signal import savgol_filter
 from nmpm._support.messages import counted
 from nmpm.data.array_checks import broken_frames, particles_far_away
 from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset, Options
-from nmpm.data.facts.sample import take_sample
-from nmpm.data.facts.timing import step_by_velocities
+from nmpm.data.facts import take_sample
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.times import find_time_fault, increasing_frames, recorded_times, take_frames, usual_step
+from nmpm.data.times import (
+    find_time_fault,
+    increasing_frames,
+    recorded_times,
+    step_by_velocities,
+    take_frames,
+    usual_step,
+)
 from nmpm.errors import DataError
 
 _log = logging.getLogger(__name__)
@@ -35,48 +41,29 @@ Piece = tuple[int, int]
 
 
 def retime(dataset: ForeignDataset, options: Options) -> ForeignDataset:
-    """The dataset at the even times and with the smoothing that a user asks for.
+    """The dataset at the even times and with the smoothing that a user asks for; a stated dt overrules recorded times.
 
     Raises:
         DataError: on reading, if there are no times to resample.
     """
-    metadata, notes = dataset.metadata, dataset.notes
-    changes = list[Callable[[Trajectory], Trajectory]]()
     if options.dt is not None:
-        changes.append(_without_times)
+        dataset = dataset.map(_without_times)
     if options.resample is not None:
-        dt = None if "dt" in dataset.unknown else metadata.dt
-        changes.append(partial(_resample_stored, dt=dt, step=options.resample, metadata=metadata))
         if dataset.steps:
-            changes.insert(-1, _with_steps_as_times)
-        metadata = replace(metadata, dt=options.resample, sequence_length=UNKNOWN_LENGTH)
-        notes = (*notes, f"Positions are interpolated to frames that are {options.resample:g} apart in time.")
+            dataset = dataset.map(_with_steps_as_times)
+        dt = None if "dt" in dataset.unknown else dataset.metadata.dt
+        metadata = replace(dataset.metadata, dt=options.resample, sequence_length=UNKNOWN_LENGTH)
+        dataset = dataset.map(partial(_resample_stored, dt=dt, step=options.resample, metadata=metadata), metadata)
+        note = f"Positions are interpolated to frames that are {options.resample:g} apart in time."
+        dataset = replace(dataset, notes=(*dataset.notes, note), unknown=dataset.unknown - {"dt"})
     if options.smooth is not None:
-        changes.append(partial(smooth, frames=options.smooth, metadata=metadata))
-        notes = (
-            *notes,
-            f"Positions are smoothed by quadratic fits to {options.smooth} frames; errors are against these.",
-        )
-    return replace(
-        dataset,
-        metadata=metadata,
-        notes=notes,
-        splits={name: partial(_apply, start, changes) for name, start in dataset.splits.items()},
-        unknown=dataset.unknown - ({"dt"} if options.resample is not None else set()),
-    )
-
-
-def _apply(
-    start: Callable[[], Iterator[Trajectory]], changes: list[Callable[[Trajectory], Trajectory]]
-) -> Iterator[Trajectory]:
-    for trajectory in start():
-        for change in changes:
-            trajectory = change(trajectory)
-        yield trajectory
+        dataset = dataset.map(partial(smooth, frames=options.smooth, metadata=dataset.metadata))
+        note = f"Positions are smoothed by quadratic fits to {options.smooth} frames; errors are against these."
+        dataset = replace(dataset, notes=(*dataset.notes, note))
+    return dataset
 
 
 def _without_times(trajectory: Trajectory) -> Trajectory:
-    """The trajectory without recorded times, which a stated time between frames overrules."""
     return replace(trajectory, fields={name: values for name, values in trajectory.fields.items() if name != "time"})
 
 
@@ -150,10 +137,14 @@ def resample(trajectory: Trajectory, time: np.ndarray, step: float, metadata: Me
     breaks = 1 + np.flatnonzero(steps > _GAP * max(float(np.median(steps)), step))
     nearest = np.abs(time[:, None] - new).argmin(axis=0)
 
-    def at_new_times(values: np.ndarray, periods: np.ndarray) -> np.ndarray:
-        def spline(piece: Piece, tracks: np.ndarray) -> tuple[slice, np.ndarray]:
-            return _spline(time[slice(*piece)], tracks, new, _TOLERANCE * step)
+    def spline(piece: Piece, tracks: np.ndarray) -> tuple[slice, np.ndarray]:
+        recorded, tolerance = time[slice(*piece)], _TOLERANCE * step
+        first, last = np.searchsorted(new, [recorded[0] - tolerance, recorded[-1] + tolerance]).tolist()
+        if len(recorded) == 1:
+            return slice(first, last), np.broadcast_to(tracks, (last - first, *tracks.shape[1:]))
+        return slice(first, last), CubicSpline(recorded, tracks)(new[first:last])
 
+    def at_new_times(values: np.ndarray, periods: np.ndarray) -> np.ndarray:
         return _by_pieces(values, breaks, len(new), periods, spline)
 
     position = _wrapped(trajectory.position, metadata, at_new_times)
@@ -176,32 +167,18 @@ def smooth(trajectory: Trajectory, frames: int, metadata: Metadata) -> Trajector
     three or less stay as they are. Fields are not smoothed.
     """
 
-    def smoothed(values: np.ndarray, periods: np.ndarray) -> np.ndarray:
-        def fit(piece: Piece, tracks: np.ndarray) -> tuple[slice, np.ndarray]:
-            return slice(*piece), _fit(tracks, frames)
+    def fit(piece: Piece, tracks: np.ndarray) -> tuple[slice, np.ndarray]:
+        if len(tracks) >= frames:
+            tracks = savgol_filter(tracks, frames, _ORDER, axis=0, mode="interp")
+        elif len(tracks) > _ORDER + 1:
+            basis, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, len(tracks)), _ORDER + 1))
+            tracks = basis @ (basis.T @ tracks)
+        return slice(*piece), tracks
 
+    def smoothed(values: np.ndarray, periods: np.ndarray) -> np.ndarray:
         return _by_pieces(values, np.empty(0, int), len(values), periods, fit)
 
     return replace(trajectory, position=_wrapped(trajectory.position, metadata, smoothed))
-
-
-def _spline(time: np.ndarray, tracks: np.ndarray, new: np.ndarray, tolerance: float) -> tuple[slice, np.ndarray]:
-    """The new frames within a piece of (n, C) tracks, and the values there."""
-    first, last = np.searchsorted(new, [time[0] - tolerance, time[-1] + tolerance])
-    within = slice(int(first), int(last))
-    if len(time) == 1:
-        return within, np.broadcast_to(tracks, (within.stop - within.start, *tracks.shape[1:]))
-    return within, CubicSpline(time, tracks)(new[within])
-
-
-def _fit(tracks: np.ndarray, frames: int) -> np.ndarray:
-    """(n, C) tracks after local quadratic fits."""
-    if len(tracks) >= frames:
-        return np.asarray(savgol_filter(tracks, frames, _ORDER, axis=0, mode="interp"))
-    if len(tracks) <= _ORDER + 1:
-        return tracks
-    basis, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, len(tracks)), _ORDER + 1))
-    return np.asarray(basis @ (basis.T @ tracks))
 
 
 def _by_pieces(

@@ -1,18 +1,30 @@
-"""Runs made of named arrays: where they are among the arrays of a file, and the trajectory of each."""
+"""Runs made of named arrays, of a file or in memory: where they are, and the trajectory of each."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 
 from nmpm.data.array_checks import check_axes
-from nmpm.data.convert.base import find_split_name, located
+from nmpm.data.convert.base import (
+    EVERYTHING_UNKNOWN,
+    Facts,
+    ForeignDataset,
+    Options,
+    Run,
+    cut,
+    find_split_name,
+    located,
+    open_divided,
+    placeholder_metadata,
+)
 from nmpm.data.convert.named_arrays import (
     AXES,
     CONSTANT,
@@ -30,12 +42,12 @@ from nmpm.data.convert.named_arrays import (
     plain_name,
     plane_notes,
     position_name,
+    transposition,
     type_ids,
     usual_position,
 )
-from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Facts, cut, placeholder_metadata
-from nmpm.data.convert.track_rows import TrackRows
-from nmpm.data.format import ID, TRACK, Metadata, Trajectory
+from nmpm.data.convert.tracks import TrackRows
+from nmpm.data.format import ID, SPLITS, TRACK, Metadata, Trajectory
 from nmpm.errors import DataError
 from nmpm.scene import Boundary, Interval
 
@@ -66,7 +78,7 @@ class RunArrays:
         object.__setattr__(self, "arrays", arrays)
         object.__setattr__(self, "roles", find_roles(arrays, name))
 
-    @property
+    @cached_property
     def _shape(self) -> tuple[int, ...]:
         """(T, N, D), or (R, T, N, D) where runs are stacked."""
         return tuple(self.arrays[self.roles["position"]].shape)
@@ -84,13 +96,9 @@ class RunArrays:
     @cached_property
     def field_names(self) -> tuple[str, ...]:
         """Names of the further arrays that fit frames or particles."""
-        return tuple(
-            name
-            for name, array in self.arrays.items()
-            if name not in self.roles.values()
-            and array.dtype.kind in "biuf"
-            and (self._fits(array.shape) or self._per_run(array))
-        )
+        others = (name for name in self.arrays if name not in self.roles.values())
+        numbers = ((name, self.arrays[name]) for name in others if self.arrays[name].dtype.kind in "biuf")
+        return tuple(name for name, array in numbers if self._fits(array.shape) or self._per_run(array))
 
     def _fits(self, shape: Sequence[int]) -> bool:
         return not shape or shape[0] in self._shape[-3:-1]
@@ -103,23 +111,17 @@ class RunArrays:
         return not self._fits(shape) if len(shape) == 1 else self._fits(shape[1:])
 
     def _take(self, name: str, run: int) -> np.ndarray:
+        """An array in a run; (T, N, 1), (N, 1) and (T, 1) values without their last axis, but for vectors."""
         array = self.arrays[name]
-        return np.asarray(array[run] if self._per_run(array) else array[()])
+        values, sizes = np.asarray(array[run] if self._per_run(array) else array[()]), self._shape[-3:-1]
+        shapes = (sizes, sizes[1:], sizes[:1])
+        vectors = {self.roles.get(meaning) for meaning in ("position", "velocity", "bounds")}
+        one = values.ndim > 1 and values.shape[-1] == 1 and values.shape not in shapes and values.shape[:-1] in shapes
+        return values[..., 0] if one and name not in vectors else values
 
     def _fact(self, meaning: str, run: int = 0) -> np.ndarray | None:
         """The array of a meaning in a run; None where there is none."""
-        name = self.roles.get(meaning)
-        if name is None:
-            return None
-        values = self._take(name, run)
-        return self._without_last(values) if meaning in ("types", "active", "time", "id") else values
-
-    def _without_last(self, values: np.ndarray) -> np.ndarray:
-        """(T, N, 1), (N, 1) and (T, 1) values of particles or frames without their last axis."""
-        sizes = self._shape[-3:-1]
-        shapes = (sizes, sizes[1:], sizes[:1])
-        one = values.ndim > 1 and values.shape[-1] == 1 and values.shape not in shapes
-        return values[..., 0] if one and values.shape[:-1] in shapes else values
+        return self._take(self.roles[meaning], run) if meaning in self.roles else None
 
     def facts(self) -> Facts:
         """Metadata from the arrays, names of those that are unknown, and notes on how arrays are read."""
@@ -133,12 +135,18 @@ class RunArrays:
         fields = f"; fields {', '.join(self.field_names)}" if self.field_names else ""
         left_out = f" Left out, as they fit neither: {describe(rest, len(rest))}." if rest else ""
         notes = (f"Arrays: {', '.join(shapes)}{fields}.{left_out}", *plane_notes(constant))
-        return placeholder_metadata(dim, **stated, extra={CONSTANT: constant} if constant else {}), unknown, notes
+        metadata = placeholder_metadata(dim, **stated, extra={CONSTANT: constant} if constant else {})
+        return Facts(metadata, unknown, notes)
 
     def _stated(self, dim: int, constant: Mapping[str, float]) -> dict[str, Any]:
         """Fields of `Metadata` that arrays state, for data of so many axes."""
         bounds = [bound for axis, bound in zip(AXES, self._bounds(), strict=False) if axis not in constant]
-        facts: dict[str, Any] = {"particle_types": self._type_names(), "bounds": tuple(bounds)}
+        types, names = self.roles.get("types"), self._fact("type_names")
+        facts: dict[str, Any] = {"bounds": tuple(bounds)}
+        if types is not None and self.arrays[types].dtype.kind in "SUO":  # stored as names
+            facts["particle_types"] = dict(enumerate(sorted(set(as_text(self.arrays[types][()]).flat))))
+        elif names is not None:
+            facts["particle_types"] = {i: name for i, name in enumerate(as_text(names).tolist()) if name}
         for name in ("dt", "particle_volume"):
             value = self._fact(name)
             if value is not None and np.isfinite(value).all() and (value > 0).all():
@@ -146,16 +154,9 @@ class RunArrays:
         boundary, static = self._fact("boundary"), self._fact("static_types")
         if boundary is not None and set(as_text(boundary)) <= set(get_args(Boundary)):
             facts["boundary"] = tuple(drop_axis(as_text(boundary), constant).tolist()[:dim])
-        if static is not None and facts["particle_types"]:
+        if static is not None and facts.get("particle_types"):
             facts["static_types"] = frozenset(static.tolist())
         return {name: value for name, value in facts.items() if value or name == "static_types"}
-
-    def _type_names(self) -> dict[int, str]:
-        """Names of type ids, where types are stored as names or names beside them; else empty."""
-        types, names = self.roles.get("types"), self._fact("type_names")
-        if types is not None and self.arrays[types].dtype.kind in "SUO":
-            return dict(enumerate(sorted(set(as_text(self.arrays[types][()]).flat))))
-        return {} if names is None else {i: name for i, name in enumerate(as_text(names).tolist()) if name}
 
     def _bounds(self) -> tuple[Interval, ...]:
         """(lower, upper) per axis, from (D, 2) or (2, D) numbers; () where there are none that fit."""
@@ -181,29 +182,41 @@ class RunArrays:
         gravity, attributes = self._fact("gravity", run), {}
         if gravity is not None and gravity.ndim == 1 and len(gravity) >= metadata.dim:
             attributes = {"gravity": drop_axis(gravity, constant)[: metadata.dim].astype(np.float64)}
-        fields = self._fields(run, constant, where)
+        fields = {name.replace("/", "_"): self._take(name, run) for name in self.field_names}
+        velocity, time = self._fact("velocity", run), self._fact("time", run)
+        if velocity is not None:
+            fields["velocity"] = drop_axis(velocity, constant).astype(np.float32)
+        if time is not None:
+            fields["time"] = as_times(time, f"{where}: {self.roles['time']}")
         ids = self._ids(run, fields, position)
         with located(where):
-            if ids.ndim == 2:
+            if ids is not None and ids.ndim == 2:
                 return replace(_by_ids(ids, position, types, fields, where), attributes=attributes)
-            fields |= {ID: ids} if len(ids) else {}
+            fields |= {} if ids is None else {ID: ids}
             trajectory = Trajectory(position, _constant_types(types, where), attributes, fields)
         return cut(trajectory, range(len(position)))
 
-    def _ids(self, run: int, fields: dict[str, np.ndarray], position: np.ndarray) -> np.ndarray:
-        """(N,) ids of the columns, (T, N) where columns hold other particles in other frames; (0,) if there are none.
+    def _ids(self, run: int, fields: dict[str, np.ndarray], position: np.ndarray) -> np.ndarray | None:
+        """(N,) ids of the columns, (T, N) where columns hold other particles in other frames; None if there are none.
 
-        Numbers that are no ids, and those of columns that hold particles one after the other, are left to the fields.
+        Ids are whole numbers or texts that differ between the particles of a frame. Other numbers, and those of columns
+        that hold particles one after the other, are left to the fields.
         """
-        ids, none = self._fact("id", run), np.zeros(0, np.int64)
+        ids = self._fact("id", run)
         if ids is None:
-            return none
-        name, there = self.roles["id"], ~np.isnan(position[..., 0])
+            return None
+        there = ~np.isnan(position[..., 0])
         ids = np.char.encode(ids, "utf-8") if ids.dtype.kind == "U" else ids
-        if plain_name(name) == TRACK or not _are_ids(np.broadcast_to(ids, there.shape), there):
-            fields[name] = ids
-            return none
-        first = np.take_along_axis(np.broadcast_to(ids, there.shape), there.argmax(axis=0)[None], axis=0)[0]
+        in_frames = np.broadcast_to(ids, there.shape)
+        whole = ids.dtype.kind != "f" or bool((in_frames == np.round(in_frames))[there].all())
+        if (
+            plain_name(self.roles["id"]) == TRACK
+            or not whole
+            or any(len(np.unique(row[here])) < here.sum() for row, here in zip(in_frames, there, strict=True))
+        ):
+            fields[self.roles["id"]] = ids
+            return None
+        first = np.take_along_axis(in_frames, there.argmax(axis=0)[None], axis=0)[0]
         ids = first if ((ids == first) | ~there).all() else ids
         return ids.astype(np.int64) if ids.dtype.kind == "f" else ids
 
@@ -238,21 +251,6 @@ class RunArrays:
         if values.dtype.kind == "f" and not (values == np.round(values)).all():
             raise DataError(f"{where}: {name} must be whole numbers.")
         return values.astype(np.int64)
-
-    def _fields(self, run: int, constant: Mapping[str, float], where: str) -> dict[str, np.ndarray]:
-        fields = {name.replace("/", "_"): self._without_last(self._take(name, run)) for name in self.field_names}
-        velocity, time = self._fact("velocity", run), self._fact("time", run)
-        if velocity is not None:
-            fields["velocity"] = drop_axis(velocity, constant).astype(np.float32)
-        if time is not None:
-            fields["time"] = as_times(time, f"{where}: {self.roles['time']}")
-        return fields
-
-
-def _are_ids(ids: np.ndarray, there: np.ndarray) -> bool:
-    """Whether (T, N) values are whole numbers or texts that differ between the particles that are there in a frame."""
-    whole = ids.dtype.kind != "f" or bool((ids == np.round(ids))[there].all())
-    return whole and all(len(np.unique(row[here])) == here.sum() for row, here in zip(ids, there, strict=True))
 
 
 def _by_ids(
@@ -338,3 +336,62 @@ def _runs_in_folder(inside: Arrays, shared: Arrays, where: str, split: str | Non
 
 def _split_name(name: str) -> str | None:
     return find_split_name(*re.findall(r"[a-z]+", name.lower()))
+
+
+RunInMemory = np.ndarray | Mapping[str, np.ndarray]
+Runs = np.ndarray | Iterable[Trajectory | RunInMemory]
+"""Runs as a (R, T, N, D) array, or one by one: (T, N, D) positions, arrays by name, or trajectories."""
+
+
+@dataclass(frozen=True)
+class _MemoryRun(Run):
+    """A run in memory; `file` is its number."""
+
+    source: RunArrays | Trajectory = field(kw_only=True)
+
+
+def open_runs(runs: Runs | Mapping[str, Runs], options: Options) -> ForeignDataset:
+    """The dataset of runs in memory: by split as a dict states them, else divided by `divide`.
+
+    Raises:
+        DataError: if there are none, or arrays do not fit together; names the run.
+        ConfigError: if an option is invalid.
+    """
+    divided = isinstance(runs, Mapping) and set(runs) <= set(SPLITS)
+    parts: Mapping[str, Any] = runs if isinstance(runs, Mapping) and divided else {"all": runs}
+    splits = {name: list(_each(part, f"{name} " if divided else "")) for name, part in parts.items()}
+    first = next((part[0] for part in splits.values() if part), None)
+    if first is None:
+        raise DataError("There are no runs to write.")
+    if isinstance(first.source, RunArrays):
+        facts = first.source.facts()
+    elif first.source.metadata is not None:
+        facts = Facts(first.source.metadata)
+    else:
+        facts = Facts(placeholder_metadata(first.source.position.shape[2]), EVERYTHING_UNKNOWN)
+    return open_divided(splits, facts, _read, options)
+
+
+def _read(runs: Sequence[_MemoryRun], metadata: Metadata) -> Iterator[Trajectory]:
+    for run in runs:
+        source = run.source
+        yield run.take(source if isinstance(source, Trajectory) else source.read(run.index, metadata))
+
+
+def _each(runs: Runs | Mapping[str, Any], where: str) -> Iterator[_MemoryRun]:
+    items = [runs] if isinstance(runs, Mapping | np.ndarray | Trajectory) else runs
+    for number, item in enumerate(items):
+        name = f"{where}run {number}"
+        if isinstance(item, Trajectory):
+            yield _MemoryRun(Path(name), 0, len(item.position), source=item)
+            continue
+        named = item if isinstance(item, Mapping) else {"position": item}
+        arrays = {key: np.asarray(array) for key, array in named.items()}
+        groups = list(group_runs(arrays, name))
+        if not groups:
+            shapes = ", ".join(f"{key} {array.shape}" for key, array in arrays.items())
+            found = transposition(max(arrays.values(), key=np.size))
+            mend = "" if found is None else f" Its axes look like ({found[1]}): np.transpose(…, {found[0]})."
+            raise DataError(f"{name}: none of the arrays is (T, N, D) or (R, T, N, D) positions ({shapes}).{mend}")
+        for group in groups:
+            yield from (_MemoryRun(Path(name), index, group.frames, source=group) for index in range(group.count))

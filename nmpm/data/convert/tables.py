@@ -1,29 +1,51 @@
-"""Tables with a header, read in chunks of rows: CSV and its relatives, gzipped or not, and Parquet."""
+"""Tables with a header, read in chunks of rows: CSV and its relatives, gzipped or not, and Parquet; a table per frame.
+
+Names of columns may end in units.
+"""
 
 from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from importlib.util import find_spec
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
-from nmpm._support.bounded_files import check_regular
+from nmpm._support.bounded_files import expansion_limit
 from nmpm._support.isolated import call_isolated, iterate_isolated
-from nmpm._support.messages import install, one_line
+from nmpm._support.messages import one_line
 from nmpm._support.progress import progress_bar
-from nmpm.data.convert.named_arrays import component_names
-from nmpm.data.convert.text_lines import Lines, is_number, open_lines, text_array
-from nmpm.data.parquet_columns import column_names, read_batches
-from nmpm.errors import ConfigError, DataError
+from nmpm.data.convert.base import located, needs
+from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.data.convert.frames import ARRAY_NAMES, Frame
+from nmpm.data.convert.named_arrays import USUAL_NAMES, as_dates, as_times, component_names
+from nmpm.data.convert.text_frames import Lines, is_number, open_lines, text_array
+from nmpm.errors import DataError
 
 SUFFIXES = ("*.csv", "*.csv.gz", "*.tsv", "*.tsv.gz", "*.txt", "*.txt.gz", "*.parquet")
 ROWS = 100_000
 """Rows of a chunk."""
+USUAL_COLUMNS: Mapping[str, tuple[str, ...]] = {
+    "frame": (
+        "frame", "frames", "framenumber", "frameindex", "frameid", "framenr", "step", "timestep", "iteration", "image",
+    ),
+    "time": ("time", "times", "t", "timestamp", "positiont", "seconds"),
+    "track": (
+        "track", "trackid", "tracknumber", "particle", "particleid", "pid", "id", "ids", "object", "objectid", "label",
+    ),
+    "run": (
+        "run", "runid", "trajectory", "trajectoryid", "traj", "experiment", "experimentid", "simulation", "sim", "case",
+    ),
+    "types": ("type", "types", "particletype", "material", "materialid", "phase", "species", "kind", "class"),
+    "active": USUAL_NAMES["active"],
+}  # fmt: skip
+"""Names of columns by what they mean, in lower case without separators and units."""
 _UNITS = "[nuµμmck]?m|px|pixels?|[nuµμm]?s|sec|kg|g"
+_VALUE_BYTES = 8
 _LARGE = 32  # MiB of a file beyond which its progress is shown
 _BLOCK = 2**22  # bytes that are parsed at a time
 
@@ -34,8 +56,8 @@ Chunk = Mapping[str, np.ndarray]
 def read_columns(path: Path) -> tuple[str, ...]:
     """Names of a table's columns; none if it has no header."""
     if path.suffix == ".parquet":
-        _check_parquet(path)
-        return tuple(call_isolated(column_names, path))
+        needs(path, "Parquet", "pyarrow", "tables")
+        return tuple(call_isolated(parquet_columns, path))
     with open_lines(path, "a table") as lines:
         return _header(lines)[0]
 
@@ -48,15 +70,21 @@ def read_chunks(path: Path, columns: Sequence[str]) -> Iterator[Chunk]:
         ConfigError: if a package that reads the format is not installed.
     """
     if path.suffix == ".parquet":
-        _check_parquet(path)
-        for batch in iterate_isolated(read_batches, path, list(columns), ROWS):
+        needs(path, "Parquet", "pyarrow", "tables")
+        for batch in iterate_isolated(parquet_batches, path, list(columns), ROWS):
             yield {name: _arrow_column(values) for name, values in batch.items()}
         return
-    with open_lines(path, "a table") as lines, _progress(path) as advance_to:
+    size, done = path.stat().st_size // 2**20, 0
+    with (
+        open_lines(path, "a table") as lines,
+        progress_bar(f"Reading {path.name}, MiB", size) if size >= _LARGE else nullcontext() as advance,
+    ):
         names, delimiter = _header(lines)
         before = lines.number
         while texts := lines.texts(_BLOCK):
-            advance_to(lines.stored)
+            if advance is not None:
+                advance(by=lines.stored // 2**20 - done)
+                done = lines.stored // 2**20
             rows = [line for line in texts if line.strip() and line[0] not in "#%"]
             table = _parse(rows, names, delimiter)
             if table is None:
@@ -66,26 +94,45 @@ def read_chunks(path: Path, columns: Sequence[str]) -> Iterator[Chunk]:
             before = lines.number
 
 
+def parquet_columns(path: Path) -> list[str]:
+    """Names of the columns of a Parquet file; for child processes, as Arrow crashes on damaged files."""
+    from pyarrow.parquet import ParquetFile
+
+    with ParquetFile(path) as file:
+        return list(map(str, file.schema_arrow.names))
+
+
+def parquet_batches(path: Path, columns: Sequence[str], rows: int) -> Iterator[dict[str, np.ndarray | list[str]]]:
+    """Yields some columns of a Parquet file, so many rows at a time: numbers, dates, or texts ("" for no value).
+
+    Raises:
+        DataError: if the file declares far more values than it stores.
+    """
+    from pyarrow.parquet import ParquetFile
+
+    with ParquetFile(path) as file:
+        count, size = file.metadata.num_rows, path.stat().st_size
+        if count * len(file.schema_arrow.names) * _VALUE_BYTES > expansion_limit(size):
+            raise DataError(f"{path}: it declares {count:,} rows but has {size:,} bytes. Is it complete?")
+        for batch in file.iter_batches(batch_size=rows, columns=list(columns), use_threads=False):
+            arrays = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in columns}
+            yield {
+                name: values
+                if values.dtype.kind in "biufmM"
+                else ["" if item is None else str(item) for item in values.tolist()]
+                for name, values in arrays.items()
+            }
+
+
+def _arrow_column(values: np.ndarray | list[str]) -> np.ndarray:
+    if isinstance(values, list):
+        return _column(values, ",")
+    return values if values.dtype.kind == "M" else as_times(values, "a column")
+
+
 def join_chunks(chunks: Sequence[Chunk]) -> dict[str, np.ndarray]:
     """The columns of all chunks; none where there is no chunk."""
     return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in (chunks[0] if chunks else ())}
-
-
-@contextmanager
-def _progress(path: Path) -> Iterator[Callable[[int], object]]:
-    """A function that shows how many bytes of a large text file are read."""
-    total, done = path.stat().st_size // 2**20, 0
-    if total < _LARGE:
-        yield lambda _: None
-        return
-
-    def advance_to(stored: int) -> None:
-        nonlocal done
-        step(by=stored // 2**20 - done)
-        done = stored // 2**20
-
-    with progress_bar(f"Reading {path.name}, MiB", total) as step:
-        yield advance_to
 
 
 def _parse(rows: list[str], names: Sequence[str], delimiter: str | None) -> Chunk | None:
@@ -167,26 +214,13 @@ def _column(cells: list[str], delimiter: str | None) -> np.ndarray:
         return texts
 
 
-def as_numbers(values: np.ndarray, what: str) -> np.ndarray:
-    """The numbers of a column; raises a DataError, naming what it is, for texts."""
-    if values.dtype.kind != "f":
-        number = next((index for index, text in enumerate(values.tolist()) if not is_number(text)), 0)
-        raise DataError(f"{what} must contain numbers, but has {one_line(str(values[number]), 40)!r}.")
-    return values
-
-
-def _check_parquet(path: Path) -> None:
-    check_regular(path)
-    if find_spec("pyarrow") is None:
-        raise ConfigError(f"{path}: reading Parquet needs pyarrow: {install('tables')}.")
-
-
-def _arrow_column(values: np.ndarray | list[str]) -> np.ndarray:
-    if isinstance(values, list):
-        return _column(values, ",")
-    if values.dtype.kind == "m":  # durations, in seconds
-        return values / np.timedelta64(1, "s")
-    return values if values.dtype.kind == "M" else values.astype(np.float64)
+def number_columns(table: Chunk, names: Sequence[str]) -> np.ndarray:
+    """Some columns as (n, columns) numbers; raises a DataError for texts."""
+    for name in names:
+        if table[name].dtype.kind != "f":
+            text = next((text for text in table[name].tolist() if not is_number(text)), table[name][0])
+            raise DataError(f"the column {name} must contain numbers, but has {one_line(str(text), 40)!r}.")
+    return np.stack([table[name] for name in names], axis=-1)
 
 
 def plain_column(name: str) -> str:
@@ -199,3 +233,55 @@ def plain_column(name: str) -> str:
 def one_cell(value: object) -> str:
     """A cell of a column as text: numbers without trailing zeros."""
     return f"{value:.15g}" if isinstance(value, float) else str(value)
+
+
+def coordinate_columns(names: Sequence[str]) -> tuple[str, ...]:
+    """The columns of the coordinates x, y and z, as far as there are."""
+    return component_names({plain_column(name): name for name in reversed(names)}, "position")
+
+
+def table_frame(table: Chunk) -> Frame:
+    """The particles of a frame, a row each; raises a DataError if there are no coordinates."""
+    names = coordinate_columns(list(table))
+    if not names:
+        found = ", ".join(list(table)[:12]) or "no header"
+        raise DataError(f"no columns x, y of coordinates (found: {found}).")
+    arrays = {
+        plain if (plain := plain_column(name)) in ARRAY_NAMES else name: values
+        for name, values in table.items()
+        if name not in names
+    }
+    return Frame(number_columns(table, names), arrays)
+
+
+_SAME_IN_FRAME = {*USUAL_COLUMNS["frame"], *USUAL_COLUMNS["time"]}
+
+
+class CsvFrames(FrameFormat):
+    """A table per frame; a time or frame in it is the same in all rows."""
+
+    summary: ClassVar[str] = "tables with a file per frame (.csv, .tsv, also .gz; .parquet): x, y, z"
+    patterns: tuple[str, ...] = ("*.csv", "*.csv.gz", "*.tsv", "*.tsv.gz", "*.parquet")
+
+    def recognises(self, path: Path) -> bool:
+        files = next(self._folders(path), (path, []))[1]
+        return len(files) > 1 and all(map(_is_frame, files[:2]))
+
+    def frames(self, file: Path) -> Iterator[Frame]:
+        names = read_columns(file)
+        table = {name: np.zeros(0) for name in names} | join_chunks(list(read_chunks(file, names)))
+        with located(file):
+            frame = table_frame(table)
+            arrays = {n: v for n, v in frame.arrays.items() if plain_column(n) not in _SAME_IN_FRAME}
+            times = next((table[name] for name in table if plain_column(name) in USUAL_COLUMNS["time"]), np.zeros(0))
+            dates = as_dates(times[:1])
+            first = as_times(times[:1], "its time").tolist() if dates is None else list(dates)
+        yield replace(frame, arrays=arrays, time=next(iter(first), None))
+
+
+def _is_frame(file: Path) -> bool:
+    """Whether a table is one frame: it has coordinates, and one time or frame if any."""
+    names = read_columns(file)
+    keys = [name for name in names if plain_column(name) in _SAME_IN_FRAME]
+    chunk: Chunk = next(read_chunks(file, keys), {}) if keys else {}
+    return bool(coordinate_columns(names)) and all((values == values[0]).all() for values in chunk.values())

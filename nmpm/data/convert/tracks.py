@@ -7,21 +7,22 @@ which nobody is there.
 
 from __future__ import annotations
 
+import heapq
 import logging
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from nmpm._support.messages import counted
+from nmpm.data.convert.base import EVERYTHING_UNKNOWN, Facts, Options, Run, RunFiles, located, placeholder_metadata
 from nmpm.data.convert.named_arrays import (
     AXES,
     CONSTANT,
-    USUAL_NAMES,
     as_times,
     component_names,
     constant_axis,
@@ -30,38 +31,21 @@ from nmpm.data.convert.named_arrays import (
     plane_notes,
     type_ids,
 )
-from nmpm.data.convert.run_files import EVERYTHING_UNKNOWN, Facts, Run, RunFiles, placeholder_metadata
 from nmpm.data.convert.tables import (
     SUFFIXES,
+    USUAL_COLUMNS,
     Chunk,
-    as_numbers,
     join_chunks,
+    number_columns,
     one_cell,
     plain_column,
     read_chunks,
     read_columns,
 )
-from nmpm.data.convert.track_rows import TrackRows, frame_numbers
-from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.format import ID, TRACK, Metadata, Trajectory
 from nmpm.errors import DataError, NmpmError
 
 _log = logging.getLogger(__name__)
-
-USUAL_COLUMNS: Mapping[str, tuple[str, ...]] = {
-    "frame": (
-        "frame", "frames", "framenumber", "frameindex", "frameid", "framenr", "step", "timestep", "iteration", "image",
-    ),
-    "time": ("time", "times", "t", "timestamp", "positiont", "seconds"),
-    "track": (
-        "track", "trackid", "tracknumber", "particle", "particleid", "pid", "id", "ids", "object", "objectid", "label",
-    ),
-    "run": (
-        "run", "runid", "trajectory", "trajectoryid", "traj", "experiment", "experimentid", "simulation", "sim", "case",
-    ),
-    "types": ("type", "types", "particletype", "material", "materialid", "phase", "species", "kind", "class"),
-    "active": USUAL_NAMES["active"],
-}  # fmt: skip
-"""Names of columns by what they mean, in lower case without separators and units."""
 
 
 @dataclass(frozen=True)
@@ -109,15 +93,9 @@ def table_columns(file: Path) -> Columns:
     return Columns(names, track=track, position=position, velocity=velocity, **parts)
 
 
-def coordinate_columns(names: Sequence[str]) -> tuple[str, ...]:
-    """The columns of the coordinates x, y and z, as far as there are."""
-    return component_names({plain_column(name): name for name in reversed(names)}, "position")
-
-
 class Tracks(RunFiles):
     """Tables of tracks; particles that are in no row of a frame are absent in it."""
 
-    name: ClassVar[str] = "tracks"
     summary: ClassVar[str] = "tables of tracks (.csv, .tsv, .txt, .gz, .parquet): frame or time, id, x, y, z"
     patterns: tuple[str, ...] = SUFFIXES
 
@@ -145,27 +123,25 @@ class Tracks(RunFiles):
                 raise DataError(f"{file}: {rows} do not follow each other. Sort the table by {column}.")
         return [Run(file, index) for index in range(len(names))]
 
-    def frames(self, run: Run) -> int:
-        columns = table_columns(run.file)
-        wanted = (columns.key, *((columns.run,) if columns.run else ()))
-        for index, chunks in enumerate(_split_runs(read_chunks(run.file, wanted), columns.run)):
-            if index == run.index:
-                values = join_chunks(chunks)[columns.key]
-                times = as_times(values, f"{run.file}: the column {columns.key}")
-                return frame_numbers(times[~np.isnan(times)])[1]
-        raise DataError(f"{run.file}: it has no run {run.index}.")
-
-    def facts(self, file: Path) -> Facts:
+    def facts(self, file: Path, options: Options) -> Facts:  # noqa: ARG002
         columns = table_columns(file)
-        constant = _constant_axis(file, columns.position)
-        names = _type_names(file, columns.types) if columns.types else []
+        coordinates = columns.position if len(columns.position) == len(AXES) else ()
+        wanted = [*coordinates, *([columns.types] if columns.types else [])]
+        ends, names = [np.zeros((0, len(coordinates)))], set[str]()
+        for chunk in read_chunks(file, wanted) if wanted else ():
+            if coordinates and all(chunk[name].dtype.kind == "f" for name in coordinates):
+                position = np.stack([chunk[name] for name in coordinates], axis=-1)
+                ends += [np.fmin.reduce(position)[None], np.fmax.reduce(position)[None]]
+            if columns.types and chunk[columns.types].dtype.kind == "U":
+                names.update(np.unique(chunk[columns.types]).tolist())
+        constant = constant_axis(np.concatenate(ends))
         shown = f"{columns.key}, {columns.track}, {', '.join(columns.position)}"
         fields = f"; as fields, where they are numbers: {', '.join(columns.others)}" if columns.others else ""
         extra = {CONSTANT: constant} if constant else {}
         dim = len(columns.position) - len(constant)
-        metadata = placeholder_metadata(dim, particle_types=dict(enumerate(names)), extra=extra)
+        metadata = placeholder_metadata(dim, particle_types=dict(enumerate(sorted(names))), extra=extra)
         unknown = EVERYTHING_UNKNOWN - ({"particle_types"} if names else set())
-        return metadata, unknown, (f"Columns: {shown}{fields}.", *plane_notes(constant))
+        return Facts(metadata, unknown, (f"Columns: {shown}{fields}.", *plane_notes(constant)))
 
     def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:
         columns = table_columns(file)
@@ -190,12 +166,15 @@ def track_rows(table: Chunk, columns: Columns, metadata: Metadata, where: str, f
     """The rows of a run; those without an id or position are left out, the first with a warning."""
     key = as_times(table[columns.key], f"{where}: the column {columns.key}")
     time = None if columns.time is None else as_times(table[columns.time], f"{where}: the column {columns.time}")
-    position = np.stack([as_numbers(table[name], f"{where}: the column {name}") for name in columns.position], axis=-1)
-    constant = metadata.extra.get(CONSTANT, {})
+    constant, track = metadata.extra.get(CONSTANT, {}), table[columns.track]
+    with located(where):
+        position = number_columns(table, columns.position)
+        active = np.ones(len(key)) if columns.active is None else number_columns(table, [columns.active])[:, 0]
     position = in_plane(position, metadata.dim, constant, where)
-    track = table[columns.track]
+    if not np.isin(active, (0, 1)).all():
+        raise DataError(f"{where}: {columns.active} must be 0 where a particle is absent, and 1 elsewhere.")
     unlinked = np.isnan(track) if track.dtype.kind == "f" else track == ""
-    keep = ~(unlinked | np.isnan(key) | np.isnan(position).any(axis=1)) & _active(table, columns, where)
+    keep = ~(unlinked | np.isnan(key) | np.isnan(position).any(axis=1)) & (active == 1)
     if unlinked.any():
         _log.warning("%s: %s without %s left out.", where, counted(int(unlinked.sum()), "row"), columns.track)
     if not keep.any():
@@ -207,25 +186,15 @@ def track_rows(table: Chunk, columns: Columns, metadata: Metadata, where: str, f
         types = type_ids(types, {name: i for i, name in metadata.particle_types.items()}, where)
     velocity = drop_axis(np.array(columns.velocity), constant).tolist() if columns.velocity else []
     return TrackRows(
-        first_row + np.flatnonzero(keep),
-        position[keep],
-        track[keep],
-        key[keep],
-        None if time is None else time[keep],
-        types[keep],
-        {name: table[name][keep] for name in columns.others if table[name].dtype.kind == "f"},
-        np.stack([table[name][keep] for name in velocity], axis=-1) if velocity else None,
+        row=first_row + np.flatnonzero(keep),
+        position=position[keep],
+        track=track[keep],
+        key=key[keep],
+        time=None if time is None else time[keep],
+        types=types[keep],
+        values={name: table[name][keep] for name in columns.others if table[name].dtype.kind == "f"},
+        velocity=np.stack([table[name][keep] for name in velocity], axis=-1) if velocity else None,
     )
-
-
-def _active(table: Chunk, columns: Columns, where: str) -> np.ndarray:
-    """(n,) bool, which rows are of particles that are there."""
-    if columns.active is None:
-        return np.ones(len(table[columns.key]), bool)
-    active = as_numbers(table[columns.active], f"{where}: the column {columns.active}")
-    if not np.isin(active, (0, 1)).all():
-        raise DataError(f"{where}: {columns.active} must be 0 where a particle is absent, and 1 elsewhere.")
-    return np.asarray(active == 1)
 
 
 def _split_runs(chunks: Iterable[Chunk], column: str | None) -> Iterator[list[Chunk]]:
@@ -246,19 +215,133 @@ def _split_runs(chunks: Iterable[Chunk], column: str | None) -> Iterator[list[Ch
         yield pending
 
 
-def _constant_axis(file: Path, names: Sequence[str]) -> dict[str, float]:
-    """The constant axis of a table's coordinates, of which the extremes of all chunks tell."""
-    ends = [np.zeros((0, len(names)))]
-    for chunk in read_chunks(file, names) if len(names) == len(AXES) else ():
-        if all(chunk[name].dtype.kind == "f" for name in names):
-            position = np.stack([chunk[name] for name in names], axis=-1)
-            ends += [np.fmin.reduce(position)[None], np.fmax.reduce(position)[None]]
-    return constant_axis(np.concatenate(ends))
+_JITTER = 0.1  # of the time between frames
+_GAPS = 4  # frames of a regular grid per frame that is there
+_SPARSE = 4  # entries of (T, ids) arrays per row, beyond which tracks share slots
 
 
-def _type_names(file: Path, column: str) -> list[str]:
-    """The types of a table that names them, in order of name."""
-    names = set[str]()
-    for chunk in read_chunks(file, [column]):
-        names.update(np.unique(chunk[column]).tolist() if chunk[column].dtype.kind == "U" else ())
-    return sorted(names)
+@dataclass(frozen=True)
+class TrackRows:
+    """Rows of one run: a position of a track in a frame each."""
+
+    row: np.ndarray  # (n,) numbers of the rows in the table, for messages
+    position: np.ndarray  # (n, D)
+    track: np.ndarray  # (n,) ids, numbers or texts
+    key: np.ndarray  # (n,) frame numbers, or times where there are none
+    time: np.ndarray | None  # (n,)
+    types: np.ndarray  # (n,) type ids
+    values: Mapping[str, np.ndarray]  # (n,) other numbers by name
+    velocity: np.ndarray | None  # (n, D)
+
+    def trajectory(self, where: str) -> Trajectory:
+        """The run with a particle for each track, or slots that hold one track after the other.
+
+        Tracks share slots where most of a (T, tracks) array would be empty: a slot holds tracks of one type, with at
+        least one absent frame between them, and the field `track` tells them apart; else the field `id` has the track
+        of each particle. Other columns become fields (T, N),
+        where a particle is absent with the value before (or after) that; (N,) if they are constant.
+
+        Raises:
+            DataError: if a track has two rows in a frame or changes its type; names the rows.
+        """
+        frame_of, frames = frame_numbers(self.key)
+        ids, track = np.unique(self.track, return_inverse=True)
+        ids = np.char.encode(ids, "utf-8") if ids.dtype.kind == "U" else ids
+        ids = ids.astype(np.int64) if ids.dtype.kind != "S" and (ids == np.round(ids)).all() else ids
+        self._check_rows(track, frame_of, where)
+        types = self._types_of_tracks(track, where)
+        slot_of = np.arange(len(types))
+        shared = len(types) * frames > _SPARSE * len(track)
+        if shared:
+            slot_of = assign_slots(track, frame_of, types)
+        slot, count = slot_of[track], int(slot_of.max()) + 1
+
+        def placed(values: np.ndarray, absent: Any = np.nan, dtype: Any = np.float32) -> np.ndarray:
+            array = np.full((frames, count, *values.shape[1:]), absent, dtype)
+            array[frame_of, slot] = values
+            return array
+
+        kinds = np.zeros(count, np.int64)
+        kinds[slot_of] = types
+        position = placed(self.position)
+        present = ~np.isnan(position[..., 0])
+        fields = {name: _filled(placed(values), present) for name, values in self.values.items()}
+        if not shared:
+            fields[ID] = ids
+        elif ids.dtype.kind != "i" or ids[0] < 0:
+            fields |= {ID: placed(ids[track], ids.dtype.type(), ids.dtype), TRACK: placed(track, -1, np.int64)}
+        else:
+            fields[TRACK] = placed(ids[track], -1, np.int64)
+        if self.velocity is not None:
+            fields["velocity"] = placed(self.velocity)
+        if self.time is not None:
+            with_rows, first = np.unique(frame_of, return_index=True)
+            fields["time"] = np.interp(np.arange(frames), with_rows, self.time[first])
+        return Trajectory(position, kinds, {}, fields)
+
+    def _check_rows(self, track: np.ndarray, frame_of: np.ndarray, where: str) -> None:
+        order = np.lexsort((frame_of, track))
+        same = (np.diff(track[order]) == 0) & (np.diff(frame_of[order]) == 0)
+        if same.any():
+            first = int(np.argmax(same))
+            one, other = sorted(order[first : first + 2].tolist())
+            name = one_cell(self.track[one])
+            raise DataError(
+                f"{where}: rows {self.row[one]} and {self.row[other]} are both track {name} in frame {frame_of[one]}"
+                f" (at {self.key[one]:g}). Remove one, or state the run of each in a column run."
+            )
+
+    def _types_of_tracks(self, track: np.ndarray, where: str) -> np.ndarray:
+        """(tracks,) type ids."""
+        types = np.zeros(int(track.max()) + 1, np.int64)
+        types[track] = self.types
+        changes = types[track] != self.types
+        if changes.any():
+            index = int(np.argmax(changes))
+            raise DataError(f"{where}: track {one_cell(self.track[index])} changes its type in row {self.row[index]}.")
+        return types
+
+
+def frame_numbers(key: np.ndarray) -> tuple[np.ndarray, int]:
+    """(n,) indices of the frames of rows, and the number of frames.
+
+    Frame numbers or times on a regular grid have a frame at each of its points, also where no row is; others have one
+    for each value.
+    """
+    values, index = np.unique(key, return_inverse=True)
+    if len(values) < 2:
+        return index, len(values)
+    steps = np.diff(values)
+    step = float(np.median(steps[steps < 1.5 * steps.min()]))
+    for _ in range(2):  # with a better step
+        grid = np.round((values - values[0]) / step).astype(np.int64)
+        step = float((values[-1] - values[0]) / max(grid[-1], 1))
+    regular = np.abs(values - values[0] - grid * step).max() <= _JITTER * step and (np.diff(grid) > 0).all()
+    if regular and grid[-1] < _GAPS * len(values):
+        return grid[index], int(grid[-1]) + 1
+    return index, len(values)
+
+
+def assign_slots(track: np.ndarray, frame_of: np.ndarray, types: np.ndarray) -> np.ndarray:
+    """(tracks,) the fewest slots, so that tracks in a slot have the same type and an absent frame between them."""
+    first, last = np.full(len(types), np.iinfo(np.int64).max), np.full(len(types), -1)
+    np.minimum.at(first, track, frame_of)
+    np.maximum.at(last, track, frame_of)
+    slots, count = np.empty(len(types), np.int64), 0
+    free: dict[int, list[tuple[int, int]]] = {}  # by type: last frame and slot
+    for index in np.argsort(first, kind="stable").tolist():
+        ends = free.setdefault(int(types[index]), [])
+        if ends and ends[0][0] + 1 < first[index]:
+            _, slot = heapq.heappop(ends)
+        else:
+            slot, count = count, count + 1
+        slots[index] = slot
+        heapq.heappush(ends, (int(last[index]), slot))
+    return slots
+
+
+def _filled(field: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """(T, N) values, or (N,) constant ones, of which absent particles have the one before or else after."""
+    last = np.maximum.accumulate(np.where(present, np.arange(len(present))[:, None], -1), axis=0)
+    field = np.take_along_axis(field, np.where(last < 0, present.argmax(axis=0), last), axis=0)
+    return field[0] if (field == field[0]).all() else field

@@ -1,30 +1,42 @@
-"""VTK's files of points: legacy `.vtk`, XML `.vtp` and `.vtu`, and `.pvd` lists of them with times; read by vtk."""
+"""VTK's files of points: legacy `.vtk`, XML `.vtp` and `.vtu`, and `.pvd` lists of them with times.
+
+They are read by vtk, which crashes on damaged files: in child processes (`nmpm._support.isolated`). What they declare
+is compared with what they hold before.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from importlib.util import find_spec
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 from xml.etree import ElementTree
+from xml.parsers import expat
 
-from nmpm._support.bounded_files import check_regular, check_within, read_bounded
+import numpy as np
+
+from nmpm._support.bounded_files import check_regular, check_within, expansion_limit, read_bounded
 from nmpm._support.isolated import call_isolated
-from nmpm._support.messages import install, one_line
-from nmpm.data.convert.frame import Frame
+from nmpm._support.messages import one_line
+from nmpm.data.convert.base import needs
 from nmpm.data.convert.frame_files import FrameFormat
-from nmpm.data.vtk_points import read_points
-from nmpm.errors import ConfigError, DataError
+from nmpm.data.convert.frames import Frame
+from nmpm.errors import DataError
 
 _LIST_BYTES = 2**26
 _LISTS = (".pvd", ".series")
+_HEADER_BYTES = 2**16
+_POINT_BYTES = 6  # "0 0 0 "
+_TIMES = ("timevalue", "time")
+_KINDS = ("PolyData", "UnstructuredGrid", "PPolyData", "PUnstructuredGrid")
+_REFERENCES = ("source", "file", "filename", "href")
+_BLOCK_BYTES = 2**20
 
 
 class Vtk(FrameFormat):
     """A file per frame; or a `.pvd` or ParaView's `.series` that lists the files of a run with their times."""
 
-    name: ClassVar[str] = "vtk"
     summary: ClassVar[str] = "VTK's .vtk, .vtp, .vtu, a file per frame, or .pvd, .series (extra vtk)"
     patterns: tuple[str, ...] = ("*.pvd", "*.series", "*.vtp", "*.vtu", "*.vtk")
     listings: ClassVar[tuple[str, ...]] = ("*.pvd", "*.series")
@@ -47,9 +59,7 @@ class Vtk(FrameFormat):
 
 def _read(path: Path, time: float | None) -> Frame:
     """The points of a file; `time` overrides that in the file."""
-    check_regular(path)
-    if find_spec("vtkmodules") is None or find_spec("vtkmodules.vtkIOXML") is None:
-        raise ConfigError(f"{path}: reading VTK needs pyvista: {install('vtk')}.")
+    needs(path, "VTK", "pyvista", "vtk", module="vtkmodules")
     content = call_isolated(read_points, path)
     content["left_out"] = tuple(content["left_out"])
     return Frame(**content if time is None else content | {"time": time})
@@ -61,12 +71,18 @@ def _entries(path: Path) -> list[tuple[Path, float]]:
     Raises:
         DataError: if it is not such a list, or names a file twice for a time or outside of its folder.
     """
-    content = read_bounded(path, _LIST_BYTES)
+    content, series = read_bounded(path, _LIST_BYTES), path.suffix.lower() == ".series"
     try:
-        listed = _series(content) if path.suffix.lower() == ".series" else _collection(content)
-        entries = [(path.parent / name, time) for name, time in listed]
+        if series:
+            listed = [(item["name"], item["time"]) for item in json.loads(content)["files"]]
+        elif b"<!" in content.replace(b"<!--", b""):
+            raise ValueError("a document type is declared")
+        else:
+            sets = ElementTree.fromstring(content).findall("./Collection/DataSet")  # noqa: S314 (no entities)
+            listed = [(item.attrib["file"], item.attrib["timestep"]) for item in sets]
+        entries = [(path.parent / str(name), float(time)) for name, time in listed]
     except (ElementTree.ParseError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        needed = "files need name and time" if path.suffix.lower() == ".series" else "DataSets need file and timestep"
+        needed = "files need name and time" if series else "DataSets need file and timestep"
         raise DataError(f"{path}: cannot be read as a list of VTK files ({one_line(error)}); its {needed}.") from error
     if not entries:
         raise DataError(f"{path}: it lists no file.")
@@ -78,14 +94,175 @@ def _entries(path: Path) -> list[tuple[Path, float]]:
     return sorted(entries, key=lambda entry: entry[1])
 
 
-def _collection(content: bytes) -> list[tuple[str, float]]:
-    """The names and times of a `.pvd`."""
-    if b"<!" in content.replace(b"<!--", b""):
-        raise ValueError("a document type is declared")
-    sets = ElementTree.fromstring(content).findall("./Collection/DataSet")  # noqa: S314 (no entities)
-    return [(item.attrib["file"], float(item.attrib["timestep"])) for item in sets]
+def read_points(path: Path) -> dict[str, Any]:
+    """The fields of `nmpm.data.convert.frames.Frame` that the file states.
+
+    Raises:
+        DataError: if vtk finds an error, the file declares more than it holds, or names files out of its folder.
+    """
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
+    from vtkmodules.vtkIOLegacy import vtkGenericDataObjectReader
+    from vtkmodules.vtkIOXML import vtkXMLGenericDataObjectReader
+
+    legacy = path.suffix.lower() == ".vtk"
+    if legacy:
+        _check_legacy(path)
+        reader = vtkGenericDataObjectReader()
+        for switch in ("Scalars", "Vectors", "Normals", "Tensors", "TCoords", "Fields"):
+            getattr(reader, f"ReadAll{switch}On")()
+    else:
+        _check_xml(path)
+        reader = vtkXMLGenericDataObjectReader()
+    # Messages are the only sign of a file that is cut short.
+    window = vtkStringOutputWindow()
+    vtkOutputWindow.SetInstance(window)
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    reader.SetFileName(str(path))
+    reader.Update()
+    output, problems = reader.GetOutput(), _text(window.GetOutput())
+    if output is None or re.search("error", problems, re.IGNORECASE):
+        lines = [re.sub(r"^vtk\w+ \(0x\w+\): ", "", line) for line in problems.splitlines()]
+        reason = next((line for line in lines if "rror" in line), "it is damaged")
+        raise DataError(f"{path}: cannot be read as VTK ({one_line(reason)}). Is it complete?")
+    if not output.IsA("vtkPointSet"):
+        raise _kind_error(path, output.GetClassName().removeprefix("vtk"))
+    points = output.GetPoints()
+    position = np.zeros((0, 3)) if points is None else vtk_to_numpy(points.GetData())
+    data, cells = output.GetPointData(), output.GetCellData()
+    arrays, cell_arrays = _arrays(data, vtk_to_numpy), _arrays(cells, vtk_to_numpy)
+    fit = output.GetNumberOfCells() == len(position)  # a vertex for each point
+    arrays = cell_arrays | arrays if fit else arrays
+    if (ids := data.GetGlobalIds()) is not None:
+        arrays["GlobalIds"] = vtk_to_numpy(ids)
+    for name, array in arrays.items():
+        if len(array) != len(position):
+            raise DataError(f"{path}: {one_line(name, 40)} has {len(array)} values for {len(position)} points.")
+    left_out = [] if fit else [f"{name} of cells" for name in cell_arrays]
+    fields = {"position": position, "arrays": arrays, "time": _time(output)}
+    return fields | {"left_out": left_out, "surface": _has_faces(output)}
 
 
-def _series(content: bytes) -> list[tuple[str, float]]:
-    """The names and times of a `.series`, which is JSON."""
-    return [(str(item["name"]), float(item["time"])) for item in json.loads(content)["files"]]
+def _has_faces(output: Any) -> bool:
+    """Whether there are cells other than single points and sets of points."""
+    from vtkmodules.vtkCommonDataModel import VTK_POLY_VERTEX, VTK_VERTEX, vtkCellTypes
+
+    kinds = vtkCellTypes()
+    output.GetCellTypes(kinds)
+    return any(
+        kinds.GetCellType(index) not in (VTK_VERTEX, VTK_POLY_VERTEX) for index in range(kinds.GetNumberOfTypes())
+    )
+
+
+def _text(value: str | bytes | None) -> str:
+    """A text of vtk, which comes as bytes where it is no UTF-8."""
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value or ""
+
+
+def _arrays(data: Any, convert: Any) -> dict[str, np.ndarray]:
+    """The arrays of points or cells, by name."""
+    arrays: dict[str, np.ndarray] = {}
+    for index in range(data.GetNumberOfArrays()):
+        array = data.GetAbstractArray(index)
+        name = _text(array.GetName()) or f"array{index}"
+        if array.IsNumeric():
+            arrays[name] = convert(array)
+        elif array.IsA("vtkStringArray"):
+            arrays[name] = np.array([_text(array.GetValue(i)) for i in range(array.GetNumberOfValues())], dtype=str)
+    return arrays
+
+
+def _time(output: Any) -> float | None:
+    """The time that the field data state."""
+    data = output.GetFieldData()
+    for index in range(data.GetNumberOfArrays()):
+        array = data.GetArray(index)
+        if array is not None and _text(array.GetName()).lower() in _TIMES and array.GetNumberOfValues() == 1:
+            return float(array.GetTuple1(0))
+    return None
+
+
+def _kind_error(path: Path, kind: str) -> DataError:
+    return DataError(f"{path}: it has a {one_line(kind, 40)}; particles are points.")
+
+
+def _check_legacy(path: Path) -> None:
+    """Refuses a legacy file that declares more points than fit into it."""
+    with path.open("rb") as file:
+        start = file.read(_HEADER_BYTES)
+    declared = re.findall(rb"^\s*POINTS\s+(-?\d{1,18})", start, re.MULTILINE | re.IGNORECASE)
+    _check_counts(path, list(map(int, declared)), path.stat().st_size // _POINT_BYTES)
+
+
+def _check_counts(path: Path, counts: list[int], most: int) -> None:
+    for count in counts:
+        if not 0 <= count <= most:
+            size = path.stat().st_size
+            raise DataError(f"{path}: it declares {count:,} points or cells but has {size:,} bytes. Is it complete?")
+
+
+def _check_xml(path: Path, parts: bool = True) -> None:
+    """Refuses an XML file that declares more than fits into it, or names files that are not in its folder.
+
+    Its elements are parsed up to raw data, which end what is XML; parts that it names are checked, too.
+    """
+    check_regular(path)
+    check = _XmlCheck(path)
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = check.start
+    parser.StartDoctypeDeclHandler = check.doctype
+    with path.open("rb") as file:
+        try:
+            while not check.raw and (block := file.read(_BLOCK_BYTES)):
+                parser.Parse(block, False)
+            if not check.raw:
+                parser.Parse(b"", True)
+        except expat.ExpatError as error:
+            if not check.raw:
+                raise DataError(f"{path}: cannot be read as VTK ({one_line(error)}). Is it complete?") from error
+    for part in check.parts:
+        check_within(path, part)
+        if not parts:
+            raise DataError(f"{path}: it is a part of another file, and names parts itself.")
+        _check_xml(part, parts=False)
+
+
+class _XmlCheck:
+    """What the elements of an XML file declare, as far as they are parsed."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.limit = path, expansion_limit(path.stat().st_size)
+        self.parts: list[Path] = []
+        self.raw = False
+        self._tuples = self._bytes = 0
+
+    def doctype(self, *_: object) -> None:
+        """Refuses a document type, whose entities would hide what is declared."""
+        raise DataError(f"{self.path}: cannot be read as VTK (it declares a document type).")
+
+    def start(self, name: str, attributes: Mapping[str, str]) -> None:
+        """Checks an element."""
+        if self.raw:
+            return
+        kind = attributes.get("type", "nothing")
+        if name == "VTKFile" and kind not in _KINDS:
+            raise _kind_error(self.path, kind)
+        self.raw = name == "AppendedData" and attributes.get("encoding", "raw") == "raw"
+        self.parts += [self.path.parent / value for key, value in attributes.items() if key.lower() in _REFERENCES]
+        numbers = {key: _number(value) for key, value in attributes.items() if key.startswith("NumberOf")}
+        components = numbers.pop("NumberOfComponents", 1)
+        _check_counts(self.path, [components, *numbers.values()], self.limit // _POINT_BYTES)
+        if name == "Piece":
+            self._tuples = max(numbers.values(), default=0)
+        elif name.endswith("Array"):
+            bits = re.search(r"\d+$", kind)
+            size = int(bits[0]) // 8 if bits else 1
+            self._bytes += size * max(components, 1) * max(self._tuples, *numbers.values(), 0)
+            if self._bytes > self.limit:
+                raise DataError(f"{self.path}: it declares {self._bytes:,} bytes of arrays. Is it complete?")
+
+
+def _number(text: str) -> int:
+    """The integer that a text begins with, as vtk reads it; 0 if there is none."""
+    found = re.match(r"\s*[-+]?\d{1,18}", text)
+    return int(found[0]) if found else 0

@@ -15,8 +15,8 @@ import h5py
 import numpy as np
 
 from nmpm._support.messages import one_line
-from nmpm.data.convert.frame import Frame
 from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.data.convert.frames import Frame
 from nmpm.data.format import VTKHDF
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
 from nmpm.errors import DataError
@@ -28,7 +28,6 @@ _TYPES = ("PolyData", "UnstructuredGrid")
 class VtkHdf(FrameFormat):
     """VTKHDF files of points."""
 
-    name: ClassVar[str] = "vtkhdf"
     summary: ClassVar[str] = "VTKHDF files of points (.vtkhdf), with time steps or a file per frame"
     patterns: tuple[str, ...] = ("*.vtkhdf",)
 

@@ -9,54 +9,40 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
 from nmpm._support.messages import one_line
-from nmpm.data.convert.frame import Frame, wrap
-from nmpm.data.convert.frame_files import FrameFormat
+from nmpm.data.convert.frames import Frame, wrap
 from nmpm.data.convert.named_arrays import AXES
-from nmpm.data.convert.text_lines import Lines, first_line, open_lines, parse_columns
-from nmpm.errors import DataError
+from nmpm.data.convert.text_frames import Lines, TextFrames, first_line, parse_columns
 from nmpm.scene import Boundary, Interval
 
 _MOST_COLUMNS = 10_000
 _KEY = re.compile(r"(\w+)\s*=\s*(?:\"([^\"]*)\"|'([^']*)'|(\S+))")
 
 
-class Xyz(FrameFormat):
+class Xyz(TextFrames):
     """XYZ files."""
 
-    name: ClassVar[str] = "xyz"
     summary: ClassVar[str] = "XYZ and extended XYZ (.xyz, .extxyz), also gzipped"
     patterns: tuple[str, ...] = ("*.xyz", "*.extxyz", "*.xyz.gz", "*.extxyz.gz")
+    kind: ClassVar[str] = "XYZ"
 
-    def frames(self, file: Path) -> Iterator[Frame]:
-        with open_lines(file, "XYZ") as lines:
-            for number, (comment, block) in enumerate(_blocks(lines)):
-                yield _frame(comment, block, f"{file}, frame {number}")
+    def blocks(self, lines: Lines) -> Iterator[tuple[str, str, bytes]]:
+        number = 0
+        while line := lines.next():
+            start, count = lines.number - 1, line.strip()
+            if not count:
+                continue
+            if not count.isdecimal():
+                raise ValueError(f"line {lines.number} is {one_line(line, 60)!r}; expected the number of particles")
+            yield f"frame {number}", lines.next(), lines.block(int(count), start)
+            number += 1
 
-    def count(self, file: Path) -> int:
-        with open_lines(file, "XYZ") as lines:
-            return sum(1 for _ in _blocks(lines))
-
-
-def _blocks(lines: Lines) -> Iterator[tuple[str, bytes]]:
-    """Yields the comment and the lines of particles of each frame."""
-    while line := lines.next():
-        start = lines.number - 1
-        if not line.strip():
-            continue
-        if not line.strip().isdecimal():
-            raise ValueError(f"line {lines.number} is {one_line(line, 60)!r}; expected the number of particles")
-        yield lines.next(), lines.block(int(line), start)
-
-
-def _frame(comment: str, block: bytes, where: str) -> Frame:
-    keys = {match[1].lower(): match[2] or match[3] or match[4] or "" for match in _KEY.finditer(comment)}
-    try:
+    def frame(self, header: str, block: bytes) -> Frame:
+        keys = {match[1].lower(): match[2] or match[3] or match[4] or "" for match in _KEY.finditer(header)}
         width = len(first_line(block).split())
         names = _columns(keys["properties"], width) if "properties" in keys else _plain_columns(width or 4)
         columns = parse_columns(block, [f"{name}/{part}" for name, width in names for part in range(width)])
@@ -65,11 +51,8 @@ def _frame(comment: str, block: bytes, where: str) -> Frame:
         if position.ndim != 2 or position.shape[1] > len(AXES) or position.dtype.kind != "f":
             raise ValueError("expected two or three columns of coordinates")
         box, boundary = _box(keys)
-        return Frame(
-            wrap(position, box, boundary), arrays, float(keys["time"]) if "time" in keys else None, None, box, boundary
-        )
-    except (KeyError, ValueError) as error:
-        raise DataError(f"{where}: {one_line(error)}.") from error
+        time = float(keys["time"]) if "time" in keys else None
+        return Frame(wrap(position, box, boundary), arrays, time, None, box, boundary)
 
 
 def _columns(properties: str, present: int) -> list[tuple[str, int]]:

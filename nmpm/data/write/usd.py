@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from pathlib import Path
 from tempfile import TemporaryFile
 from typing import IO, ClassVar
 
 import numpy as np
 
-from nmpm._support.atomic import atomic_write
 from nmpm._support.colours import Rgb, material_colours
-from nmpm.data.format import TRUTH, Metadata, Trajectory
+from nmpm.data.format import TRUTH
 from nmpm.data.gravity import trajectory_gravity
-from nmpm.data.write.base import TrajectoryWriter, no_step
-from nmpm.data.write.frames import Frame, frame_times, frames, pad, particle_spacing
+from nmpm.data.write.base import Clip, ClipFrame, TextWriter, pad
 
 
-class Usda(TrajectoryWriter):
+class Usda(TextWriter):
     """`UsdGeom.Points` for each type of particles, with positions, velocities and fields at a time code per frame.
 
     `timeCodesPerSecond` is 1 / dt. Particles of static types have one position. A truth has points of its own.
@@ -28,22 +25,17 @@ class Usda(TrajectoryWriter):
 
     readers: ClassVar[str] = "Blender, Houdini, Omniverse"
 
-    def write(
-        self, path: Path, trajectory: Trajectory, metadata: Metadata, step: Callable[[], object] = no_step
-    ) -> Path:
-        codes = frame_times(trajectory, metadata) / metadata.dt
+    def text(self, clip: Clip) -> Iterator[str]:
+        codes = clip.times / clip.metadata.dt
         with ExitStack() as stack:
-            clouds = _clouds(trajectory, metadata, stack)
-            for code, frame in zip(codes, frames(trajectory, metadata), strict=True):
+            clouds = _clouds(clip, stack)
+            for code, frame in zip(codes, clip.frames(), strict=True):
                 for cloud in clouds:
                     cloud.add(frame, code)
-                step()
-            with atomic_write(path) as part, part.open("w", encoding="utf-8") as file:
-                file.write(_head(codes, trajectory, metadata))
-                for cloud in clouds:
-                    file.writelines(cloud.lines())
-                file.write("}\n")
-        return path
+            yield _head(codes, clip)
+            for cloud in clouds:
+                yield from cloud.lines()
+            yield "}\n"
 
 
 @dataclass
@@ -60,7 +52,7 @@ class _Cloud:
     samples: dict[str, IO[str]] = field(default_factory=dict)  # temporary files by declared attribute
     ids: str = ""  # in the last frame
 
-    def add(self, frame: Frame, code: float) -> None:
+    def add(self, frame: ClipFrame, code: float) -> None:
         """Adds the samples of a frame."""
         if self.static and frame.number:
             return
@@ -102,10 +94,11 @@ class _Cloud:
         self.samples[declared].write(f"            {code:.9g}: {values},\n")
 
 
-def _clouds(trajectory: Trajectory, metadata: Metadata, stack: ExitStack) -> list[_Cloud]:
+def _clouds(clip: Clip, stack: ExitStack) -> list[_Cloud]:
+    trajectory, metadata = clip.trajectory, clip.metadata
     types = np.unique(trajectory.particle_type).tolist()
     names = {i: metadata.particle_types.get(i, f"type{i}") for i in types}
-    colours, width = material_colours(names.values()), particle_spacing(trajectory, metadata)
+    colours, width = material_colours(names.values()), clip.spacing
     clouds = [
         _Cloud(_identifier(name), i, i in metadata.static_types, colours[name], width, stack)
         for i, name in names.items()
@@ -118,9 +111,10 @@ def _clouds(trajectory: Trajectory, metadata: Metadata, stack: ExitStack) -> lis
     return clouds + truths
 
 
-def _head(codes: np.ndarray, trajectory: Trajectory, metadata: Metadata) -> str:
+def _head(codes: np.ndarray, clip: Clip) -> str:
+    metadata = clip.metadata
     low, high = (pad(np.array([corner]))[0].tolist() for corner in np.array(metadata.bounds).T)
-    gravity = np.abs(trajectory_gravity(trajectory.attributes, metadata, "trajectory") or (0.0, 0.0, 1.0))
+    gravity = np.abs(trajectory_gravity(clip.trajectory.attributes, metadata, "trajectory") or (0.0, 0.0, 1.0))
     up = "Z" if metadata.dim == 3 and int(np.argmax(gravity)) == 2 else "Y"
     rate = f"{1 / metadata.dt:.9g}"
     return (

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from nmpm.emulator.engines.rules import RECORDINGS, Call, takes
-from nmpm.emulator.runtimes.programs import MOST, Programs
+from nmpm.emulator.runtimes.runtime import MOST, Programs
 
 if TYPE_CHECKING:
     from nmpm.emulator.bundle import Bundle, RolloutContext

@@ -21,8 +21,7 @@ from nmpm.emulator.engines.engine import is_autocast
 from nmpm.emulator.engines.numba.parameters import DECODERS, NODES
 from nmpm.grid import Grid
 from nmpm.particles import Particles, scene_volumes
-from nmpm.transfer import Nearest, Quadratic
-from nmpm.transfer.execution import is_default, kernels_are_on
+from nmpm.transfer import Nearest, Quadratic, is_default, kernels_are_on
 
 if TYPE_CHECKING:
     from nmpm.emulator.model import Emulator

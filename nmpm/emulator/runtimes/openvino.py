@@ -21,8 +21,7 @@ from torch import Tensor, nn
 
 from nmpm._support.messages import install, one_line
 from nmpm.emulator.engines.rules import RUNTIMES, refusal
-from nmpm.emulator.runtimes.programs import Programs
-from nmpm.emulator.runtimes.runtime import Runtime, refuse_gradients
+from nmpm.emulator.runtimes.runtime import Programs, Runtime, refuse_gradients
 from nmpm.errors import ConfigError
 from nmpm.processors import GridProcessor
 

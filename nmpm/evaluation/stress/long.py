@@ -15,7 +15,7 @@ from nmpm.evaluation.stress.results import Effort, TestResult
 from nmpm.evaluation.stress.trace import INVARIANTS, Trace, filled_volume, trace_rollout
 from nmpm.metrics.quantities import measure_shape
 from nmpm.particles import Particles
-from nmpm.sim.predictability import twin_of
+from nmpm.sim.preset import twin_of
 
 MAX_DRIFT = 0.1
 """Cells per 1000 frames, root mean square: what still counts as rest."""

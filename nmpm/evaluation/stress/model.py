@@ -10,15 +10,13 @@ from fractions import Fraction
 import torch
 
 from nmpm.data.format import Trajectory
-from nmpm.data.generate import preset_metadata
-from nmpm.data.initial_states import thrown_blocks
-from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.recording import Recording, RecordingReader
-from nmpm.data.simulation import try_seeds
+from nmpm.data.recordings import RecordingReader
+from nmpm.data.simulation import preset_metadata, try_seeds
+from nmpm.data.windows import Recording, collate
 from nmpm.emulator import Emulator
 from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.emulator.similarity import Match
-from nmpm.particles import Particles, Window
+from nmpm.particles import Particles, Window, thrown_blocks
 from nmpm.scene import Reading
 from nmpm.sim import Preset
 

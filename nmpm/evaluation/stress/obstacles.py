@@ -12,14 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.rollouts import unroll
 from nmpm.evaluation.stress.model import ModelUnderTest
 from nmpm.evaluation.stress.results import Effort, TestResult
 from nmpm.evaluation.stress.trace import is_lost
-from nmpm.particles import Particles
+from nmpm.particles import Particles, lattice, state_at_rest
 from nmpm.scene import Interval
 
 Forbidden = Callable[[Tensor, int], Tensor]

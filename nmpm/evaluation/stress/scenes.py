@@ -9,7 +9,6 @@ from contextlib import suppress
 import torch
 from torch import Tensor
 
-from nmpm.data.initial_states import lattice, state_at_rest, thrown_blocks
 from nmpm.emulator.adaptation import adapted
 from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.emulator.rollouts import rollout
@@ -17,7 +16,7 @@ from nmpm.errors import ConfigError, UnstableError
 from nmpm.evaluation.stress.model import ModelUnderTest, simulate_window
 from nmpm.evaluation.stress.results import Effort, TestResult
 from nmpm.evaluation.stress.trace import INVARIANTS, Trace, rms_distance, trace_bundles, trace_rollout
-from nmpm.particles import Particles, Window
+from nmpm.particles import Particles, Window, lattice, state_at_rest, thrown_blocks
 
 SPEEDS = (0.0, 1e-3, 1.0, 3.0, 10.0)
 GRAVITIES = (0.0, 0.5, 2.0, -1.0)

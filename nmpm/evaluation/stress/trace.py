@@ -10,7 +10,7 @@ from torch import Tensor
 
 from nmpm.emulator import Emulator
 from nmpm.emulator.constraints import MOST_GAIN, lowest_potential, mass_shares
-from nmpm.emulator.input_checks import beyond_walls
+from nmpm.emulator.monitor import beyond_walls
 from nmpm.emulator.rasterise import volume_fraction
 from nmpm.emulator.rollouts import stream
 from nmpm.grid import Grid

@@ -19,15 +19,16 @@ from torch import Tensor
 from nmpm._support.digests import weights_digest
 from nmpm._support.messages import one_line
 from nmpm.emulator import Emulator, Prescribed, rollout
+from nmpm.emulator.members import predict_members
 from nmpm.emulator.prescribed import predict_from_entries, with_predicted
 from nmpm.errors import ConfigError, DataError
 from nmpm.evaluation.matched import MatchedPredictor
 from nmpm.evaluation.prediction_errors import energy_gain, recorded_energy_gain
 from nmpm.evaluation.trade.scenes import Scenes
-from nmpm.particles import Particles
+from nmpm.particles import Particles, Window
 from nmpm.scene import Scene
 from nmpm.sim import InitialState, Preset
-from nmpm.sim.predictability import nudge
+from nmpm.sim.preset import nudge
 
 Rollout = Callable[[int], Tensor]
 """From a number of frames to (B, frames, N, D) predicted positions, in domain length."""
@@ -150,9 +151,13 @@ class ModelChoice(Choice):
         if (matched := self.matched) is not None:
             there = window.to(self.device)
             return lambda frames: matched.predict(there.first(frames + 2))
-        state, prescribed = window.initial.to(self.device), Prescribed.of(window)
-        given = prescribed and prescribed.to(self.device)
-        return lambda frames: rollout(self.emulator, state, frames, prescribed=given)
+        state, prescribed = self._start(window)
+        return lambda frames: rollout(self.emulator, state, frames, prescribed=prescribed)
+
+    def _start(self, window: Window) -> tuple[Particles, Prescribed | None]:
+        """What a rollout of a window starts from, and what is prescribed to it, on the choice's device."""
+        prescribed = Prescribed.of(window)
+        return window.initial.to(self.device), prescribed and prescribed.to(self.device)
 
     def computed_frames(self, frames: int) -> int:
         if self.matched is not None:
@@ -304,3 +309,30 @@ def find_factory(path: str) -> Callable[[Scene], Predictor]:
         return predictor
 
     return make
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MembersChoice(ModelChoice):
+    """Several rollouts of each scene, see `nmpm.emulator.members`; a scene's time is that of all of them.
+
+    Args:
+        members: M. Errors of positions are those of the first, `crps` is that of all.
+        nudge: Cells by which starts are displaced, see `nmpm.emulator.members.member_starts`.
+    """
+
+    members: int
+    nudge: float
+
+    @property
+    def identity(self) -> Mapping[str, Any]:
+        return {**super().identity, "members": self.members, "nudge": self.nudge}
+
+    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
+        (index,) = indices
+        start, prescribed = self._start(scenes.window(indices))
+
+        def predict(frames: int) -> Tensor:
+            members = predict_members(self.emulator, start, frames, self.members, index, self.nudge, prescribed)
+            return members.position[:, 0]
+
+        return predict

@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from nmpm._support.messages import one_line
 from nmpm._support.progress import Step, progress_bar
 from nmpm.emulator.prescribed import with_predicted
 from nmpm.errors import NmpmError
-from nmpm.evaluation.machine import clock_for, describe_device, is_machine_failure, peak_bytes
+from nmpm.evaluation.machine import clock_for, describe_device, is_machine_failure, one_thread, peak_bytes
 from nmpm.evaluation.prediction_errors import Measures, instability, measure_errors, squared_errors
 from nmpm.evaluation.trade.choices import Choice, digest
 from nmpm.evaluation.trade.ranking import Point, Times
@@ -67,7 +68,7 @@ def measure(choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store: Stor
     with progress_bar(title, len(choices) * (len(scenes) + sweep.timing.rounds)) as step:
         rows = [measure_accuracy(choice, scenes, sweep.measures, store, step) for choice in choices]
         times = measure_times(choices, scenes, sweep.timing, store, step)
-    return [_point(*measured, scenes) for measured in zip(choices, rows, times, strict=True)]
+    return list(map(partial(_point, scenes), choices, rows, times))
 
 
 def measure_untimed(
@@ -76,7 +77,7 @@ def measure_untimed(
     """As `measure`, errors alone."""
     with progress_bar(title, len(choices) * len(scenes)) as step:
         rows = [measure_accuracy(choice, scenes, sweep.measures, store, step) for choice in choices]
-    return [_point(choice, row, Times(), scenes) for choice, row in zip(choices, rows, strict=True)]
+    return [_point(scenes, choice, row, Times()) for choice, row in zip(choices, rows, strict=True)]
 
 
 def estimate_rest(choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store: Store) -> tuple[int, float]:
@@ -101,7 +102,7 @@ def estimate_rest(choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store
     return count, total
 
 
-def _point(choice: Choice, rows: Sequence[Mapping[str, Any]], times: Times, scenes: Scenes) -> Point:
+def _point(scenes: Scenes, choice: Choice, rows: Sequence[Mapping[str, Any]], times: Times) -> Point:
     length = min(scenes.frames(index) for index in range(len(scenes)))
     names = dict.fromkeys(name for row in rows for name in row.get("errors", {}))
     shown = None
@@ -240,23 +241,20 @@ def _time_one(runner: _Runner, scenes: Scenes, turn: int, timing: Timing) -> Non
     choice = runner.choice
     indices = [(turn + offset) % len(scenes) for offset in range(choice.batch)]
     frames = min(timing.frames, *(min(scenes.moving_frames(i), scenes.frames(i)) for i in indices))
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
+    _, clock = clock_for(choice.device)
     try:
-        run = choice.prepare(scenes, indices)
-        if not runner.warm:
-            run(min(frames, _WARM_UP))
-            runner.warm = True
-        if "memory" not in runner.stored:
-            memory = peak_bytes(lambda: run(frames), choice.device)
-            runner.stored["memory"] = memory if memory == memory else None  # (NaN is no JSON)
-        _, clock = clock_for(choice.device)
-        start = clock()
-        run(frames)
-        runner.stored[str(turn)] = 1e3 * (clock() - start) / (choice.computed_frames(frames) * choice.batch)
+        with one_thread():
+            run = choice.prepare(scenes, indices)
+            if not runner.warm:
+                run(min(frames, _WARM_UP))
+                runner.warm = True
+            if "memory" not in runner.stored:
+                memory = peak_bytes(lambda: run(frames), choice.device)
+                runner.stored["memory"] = memory if memory == memory else None  # (NaN is no JSON)
+            start = clock()
+            run(frames)
+            runner.stored[str(turn)] = 1e3 * (clock() - start) / (choice.computed_frames(frames) * choice.batch)
     except NmpmError as error:
         if is_machine_failure(error):
             raise
         runner.stored["failed"] = str(error)
-    finally:
-        torch.set_num_threads(before)

@@ -12,18 +12,17 @@ from typing import Any
 
 import torch
 
-from nmpm.data.catalog import catalog, dataset_folder, ensure, find_simulated
+from nmpm.data.catalog import dataset_folder, ensure, find_simulated
 from nmpm.data.convert import Options
-from nmpm.data.generate import generate
-from nmpm.data.loading.padded_batch import collate, displacements
-from nmpm.data.loading.recording import Recording, SplitRecordings
-from nmpm.data.loading.sources import FolderSource
-from nmpm.data.motion import measure_motion
-from nmpm.data.simulation import SimulationRequest
+from nmpm.data.recordings import SplitRecordings
+from nmpm.data.simulation import SimulationRequest, generate
+from nmpm.data.sources import FolderSource
+from nmpm.data.survey import measure_motion
+from nmpm.data.windows import Recording, collate, displacements
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Window
 from nmpm.scene import Motion, Reading, Scene
-from nmpm.sim import Preset, load_preset, preset_from_dict
+from nmpm.sim import Preset, load_preset, preset_from_dict, preset_names
 
 MOVING = 0.02
 """A scene moves as long as its root mean square speed is at least this share of the largest one."""
@@ -115,7 +114,7 @@ def find_scenes(dataset: str, count: int, facts: Options | None = None) -> Scene
         DataError: if there is no such dataset, or its files are missing or wrong.
     """
     facts = facts or Options()
-    if dataset in catalog():
+    if dataset in preset_names():
         _check_unstated(dataset, facts)
         folder = find_simulated(dataset, count) or ensure(dataset, {"train": 0, "valid": 0, "test": count})
         return read_scenes(dataset, FolderSource(folder), count)
@@ -135,9 +134,9 @@ def find_wider_scenes(dataset: str, count: int, times: int) -> Scenes:
     Raises:
         ConfigError: if the dataset is not an embedded one, as recorded scenes cannot be widened.
     """
-    if dataset not in catalog():
+    if dataset not in preset_names():
         raise ConfigError(
-            f"{dataset} cannot be widened: it is not an embedded dataset. There are {', '.join(catalog())}."
+            f"{dataset} cannot be widened: it is not an embedded dataset. There are {', '.join(preset_names())}."
         )
     preset = load_preset(dataset).widened(times)
     request = SimulationRequest(preset, {"train": 0, "valid": 0, "test": count})

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import partial
 from importlib import resources
+from importlib.util import find_spec
 from itertools import product
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
 from nmpm._support.bounded_files import parse_yaml
-from nmpm._support.messages import counted
+from nmpm._support.digests import weights_digest
+from nmpm._support.machine import computes_bfloat16
+from nmpm._support.messages import counted, install
 from nmpm._support.plain_data import from_plain
 from nmpm.emulator import NETWORK_PRECISIONS, Emulator
 from nmpm.emulator.members import nudge_of
+from nmpm.emulator.similarity import Match, find_match
 from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import free_fall, still
 from nmpm.evaluation.matched import MatchedPredictor
@@ -26,19 +32,130 @@ from nmpm.evaluation.trade.choices import (
     CPU,
     Choice,
     Kind,
+    MembersChoice,
     ModelChoice,
     Predictor,
     PredictorChoice,
     SimulatorChoice,
     digest,
 )
-from nmpm.evaluation.trade.fitted import FittedModel, fit_to_scenes
-from nmpm.evaluation.trade.members import MembersChoice
-from nmpm.evaluation.trade.model_settings import ModelSettings
 from nmpm.evaluation.trade.scenes import Scenes
-from nmpm.scene import Scene
+from nmpm.scene import Reading, Scene
 from nmpm.sim import Preset
-from nmpm.sim.predictability import twin_of
+from nmpm.sim.preset import twin_of
+
+Precision = Literal["float32", "bfloat16"]
+EAGER, OPENVINO = "eager", "openvino"
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """Settings of every model; all combinations of them are measured.
+
+    Args:
+        precision: Precisions of the network; bfloat16 is left out on processors that emulate it, unless it is the only
+            one.
+        constraints: "held", with the model's constraints, and "free", without them.
+        runtime: What computes the network, see `nmpm.emulator.runtimes.RUNTIMES`; None for torch and, on a CPU,
+            OpenVINO if it is installed.
+        batch: Batch sizes, in scenes.
+        members: Rollouts of each scene by a model's first form, which stand beside it as an ensemble; 0 for none.
+    """
+
+    precision: tuple[Precision, ...] = ("float32", "bfloat16")
+    constraints: tuple[Literal["held", "free"], ...] = ("held", "free")
+    runtime: tuple[str, ...] | None = None
+    batch: tuple[int, ...] = (1, 8)
+    members: int = 0
+
+    def precisions(self, device: torch.device) -> tuple[Precision, ...]:
+        """Those that a device does not emulate; all if it emulates all."""
+        computed = tuple(name for name in self.precision if name != "bfloat16" or computes_bfloat16(device))
+        return computed or self.precision
+
+    def runtimes(self, device: torch.device) -> tuple[str, ...]:
+        """Names of those that are stated, or else installed."""
+        if self.runtime is not None:
+            return self.runtime
+        return (EAGER, OPENVINO) if device.type == "cpu" and find_spec(OPENVINO) else (EAGER,)
+
+    def left_out(self, device: torch.device) -> list[str]:
+        """What is not measured on a device, in sentences."""
+        lines = []
+        if self.precisions(device) != self.precision:
+            lines.append("bfloat16 is left out: this processor emulates it, which takes longer than float32.")
+        if self.runtime is None and device.type == "cpu" and self.runtimes(device) == (EAGER,):
+            lines.append(f"OpenVINO, often the faster runtime, is left out: {install('openvino')} adds it.")
+        return lines
+
+
+@dataclass(frozen=True)
+class FittedModel:
+    """A model as it predicts some scenes.
+
+    Args:
+        name: Of the model.
+        weights: Digest of its weights.
+        emulator: For the scenes, or for `reading.scene`.
+        differing: In what they differ from those of its training, or how they are matched; empty where they do not.
+        reading: How scenes of another kind are read; None for others.
+    """
+
+    name: str
+    weights: str
+    emulator: Emulator
+    differing: str = ""
+    reading: Reading | None = None
+
+
+def fit_to_scenes(
+    name: str,
+    emulator: Emulator,
+    scenes: Scenes,
+    materials: Mapping[str, str] | None = None,
+    stride: Fraction | None = None,
+    strict: bool = False,
+) -> FittedModel:
+    """A model for scenes that need not be its own.
+
+    Args:
+        name: Of the model.
+        emulator: The model.
+        scenes: What it is to predict.
+        materials: The model's by the data's name, as for `find_match`; left out for a model that lacks one of them.
+        stride: As for `find_match`.
+        strict: Likewise.
+
+    Raises:
+        ConfigError: if they cannot be matched, naming the model and the reason.
+
+    Warns:
+        UserWarning: of what could not be matched.
+    """
+    differing, weights = emulator.scene.differences(scenes.scene), weights_digest(emulator.state_dict())[:12]
+    if not differing and not emulator.scene.aliases and emulator.scene.materials == scenes.scene.materials:
+        return FittedModel(name, weights, emulator)
+    has_materials = set((materials or {}).values()) <= set(emulator.scene.materials)
+    given = materials if has_materials else None
+    try:
+        match = find_match(emulator, scenes.scene, scenes.motion, given, stride, strict, (name, scenes.name))
+    except ConfigError as error:
+        raise ConfigError(f"The model {name} cannot predict the scenes of {scenes.name}. {error}") from error
+    ours, theirs = match.reading.scene, scenes.scene
+    same_facts = (ours.materials, ours.gravity_known) == (theirs.materials, theirs.gravity_known)
+    if match.reading == Reading(ours) and same_facts:
+        return FittedModel(name, weights, emulator.matched(match), ", ".join(differing))
+    for warning in match.warnings:
+        warnings.warn(warning, stacklevel=3)
+    facts = f"{', '.join(differing) or 'materials'}; taken as {_in_short(match)}"
+    return FittedModel(name, weights, emulator.matched(match), facts, match.reading)
+
+
+def _in_short(match: Match) -> str:
+    """A match in a phrase: "4 frames for 1 of the data, gravity × 1.02"."""
+    gravity = "" if match.gravity is None else f", gravity × {match.gravity:.3g}"
+    return f"{counted(match.reading.between, 'frame')} for {match.reading.every} of the data{gravity}"
+
 
 OTHER_SCENES = " (of other scenes)"
 """Ends the name of a model that was trained on other scenes, in the settings."""
@@ -59,7 +176,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class SimulatorSettings:
-    """Settings of the simulator, beside the shipped one and its twin, see `nmpm.sim.predictability`.
+    """Settings of the simulator, beside the shipped one and its twin, see `nmpm.sim.preset`.
 
     Args:
         coarser: Further factors on the width of cells (SPH: on the spacing of particles), beside 1.

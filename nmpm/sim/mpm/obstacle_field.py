@@ -6,12 +6,11 @@ at the box's sides. Slanted faces cut cells at any angle, so that this alone wou
 a substep too near are pushed out.
 
 The particles' distance is interpolated from a lattice four times as fine as the cells (twice in three dimensions, for
-its size). A distance never changes faster
-than its point moves, so that interpolation errs by less than half the diagonal of a lattice cell, and a particle is
-kept at that margin: it is never inside. It is pushed out along the gradient of the distance, to the side that it is on;
-a substep that carries it past the middle of an obstacle would let it out behind. So the thinnest obstacle bounds the
-substep (`stability.py`), not the cells. Through obstacles thinner than two cells, material on the two sides shares
-nodes, and each feels a little of the other's velocity.
+its size). A distance never changes faster than its point moves, so that interpolation errs by less than half the
+diagonal of a lattice cell, and a particle is kept at that margin: it is never inside. It is pushed out along the
+gradient of the distance, to the side that it is on; a substep that carries it past the middle of an obstacle would let
+it out behind. So the thinnest obstacle bounds the substep (`preset.py`), not the cells. Through obstacles thinner than
+two cells, material on the two sides shares nodes, and each feels a little of the other's velocity.
 """
 
 from __future__ import annotations
@@ -25,7 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nmpm._support.jit import jit
-from nmpm.sim.mpm import obstacles_3d
 from nmpm.sim.state import Array
 
 Distance = Callable[[Array], NDArray[Any]]
@@ -77,7 +75,7 @@ class ObstacleField:
     def depth(self, position: Array) -> Array:
         """(N,) how much nearer to an obstacle than the margin particles (N, D) are, in length; 0 where they are not."""
         depth = np.zeros(len(position))
-        (_depths if position.shape[1] == 2 else obstacles_3d.depths)(position, self.lattice, depth)
+        _depths(position, self.lattice, depth)
         return depth
 
     def brake(self, nodes: Array, fall: Array) -> None:
@@ -85,7 +83,7 @@ class ObstacleField:
 
         `fall` (D,) is the change of velocity by gravity that follows: its part into the obstacles is removed as well.
         """
-        brake = _brake if len(fall) == 2 else obstacles_3d.brake
+        brake = _brake_2d if len(fall) == 2 else _brake_3d
         brake(nodes, fall, self.nodes, self.normals, self.friction)
 
     def push_out(self, before: Array, position: Array, velocity: Array, lower: Array, upper: Array) -> int:
@@ -94,8 +92,7 @@ class ObstacleField:
         Positions and velocities change in place. A particle that finds no room nearby, between `lower` and `upper`
         (D,), goes back to its valid position `before`, and stops.
         """
-        push_out = _push_out if len(lower) == 2 else obstacles_3d.push_out
-        pushed: int = push_out(before, position, velocity, lower, upper, self.lattice)
+        pushed: int = _push_out(before, position, velocity, lower, upper, self.lattice)
         return pushed
 
 
@@ -128,7 +125,7 @@ def slide(normal: float, tangential: float, friction: float) -> tuple[float, flo
 
 
 @jit
-def _brake(nodes: Array, fall: Array, near: NDArray[np.int64], normals: Array, friction: float) -> None:
+def _brake_2d(nodes: Array, fall: Array, near: NDArray[np.int64], normals: Array, friction: float) -> None:
     for k in range(near.shape[0]):
         i, j = near[k, 0], near[k, 1]
         mass = nodes[i, j, 0]
@@ -142,55 +139,99 @@ def _brake(nodes: Array, fall: Array, near: NDArray[np.int64], normals: Array, f
 
 
 @jit
-def _look_up(x: float, y: float, lattice: Lattice) -> tuple[float, float, float]:
-    """Distance and the direction in which it grows, by bilinear interpolation within the lattice."""
-    low, spacing, distance, _ = lattice
-    px = min(max((x - low[0]) / spacing, 0.0), distance.shape[0] - 1.000001)
-    py = min(max((y - low[1]) / spacing, 0.0), distance.shape[1] - 1.000001)
-    i, j = int(px), int(py)
-    fx, fy = px - i, py - j
-    a, b, c, d = distance[i, j], distance[i + 1, j], distance[i, j + 1], distance[i + 1, j + 1]
-    sx, sy = (1 - fy) * (b - a) + fy * (d - c), (1 - fx) * (c - a) + fx * (d - b)
-    return (1 - fy) * ((1 - fx) * a + fx * b) + fy * ((1 - fx) * c + fx * d), sx, sy
+def _brake_3d(nodes: Array, fall: Array, near: NDArray[np.int64], normals: Array, friction: float) -> None:
+    for n in range(near.shape[0]):
+        node = nodes[near[n, 0], near[n, 1], near[n, 2]]
+        mass, normal = node[0], normals[n]
+        if mass <= 0:
+            continue
+        u, v, w = node[1] + mass * fall[0], node[2] + mass * fall[1], node[3] + mass * fall[2]
+        inwards = u * normal[0] + v * normal[1] + w * normal[2]
+        if inwards >= 0:
+            continue
+        u, v, w = u - inwards * normal[0], v - inwards * normal[1], w - inwards * normal[2]
+        along = math.sqrt(u * u + v * v + w * w)
+        left = max(0.0, along + friction * inwards) / along if along > 0 else 0.0
+        node[1], node[2], node[3] = left * u - mass * fall[0], left * v - mass * fall[1], left * w - mass * fall[2]
+
+
+@jit
+def _look_up(point: Array, distance: Array, low: Array, spacing: float, slope: Array) -> float:
+    """Distance, interpolated linearly along each axis of the lattice; the direction in which it grows to `slope`."""
+    x = min(max((point[0] - low[0]) / spacing, 0.0), distance.shape[0] - 1.000001)
+    y = min(max((point[1] - low[1]) / spacing, 0.0), distance.shape[1] - 1.000001)
+    i, j = int(x), int(y)
+    fx, fy = x - i, y - j
+    if distance.ndim == 2:
+        a, b, c, d = distance[i, j], distance[i + 1, j], distance[i, j + 1], distance[i + 1, j + 1]
+        slope[0], slope[1] = (1 - fy) * (b - a) + fy * (d - c), (1 - fx) * (c - a) + fx * (d - b)
+        return float((1 - fy) * ((1 - fx) * a + fx * b) + fy * ((1 - fx) * c + fx * d))
+    z = min(max((point[2] - low[2]) / spacing, 0.0), distance.shape[2] - 1.000001)
+    k = int(z)
+    fz = z - k
+    value = slope[0] = slope[1] = slope[2] = 0.0
+    for a in range(2):
+        wx, sx = (fx, 1.0) if a else (1 - fx, -1.0)
+        for b in range(2):
+            wy, sy = (fy, 1.0) if b else (1 - fy, -1.0)
+            for c in range(2):
+                wz, sz = (fz, 1.0) if c else (1 - fz, -1.0)
+                there = distance[i + a, j + b, k + c]
+                value += wx * wy * wz * there
+                slope[0] += sx * wy * wz * there
+                slope[1] += wx * sy * wz * there
+                slope[2] += wx * wy * sz * there
+    return value
+
+
+@jit
+def _nearest(point: Array, distance: Array, low: Array, spacing: float) -> float:
+    """Distance at the nearest lattice point."""
+    i, j = int((point[0] - low[0]) / spacing + 0.5), int((point[1] - low[1]) / spacing + 0.5)
+    if distance.ndim == 2:
+        return float(distance[i, j])
+    return float(distance[i, j, int((point[2] - low[2]) / spacing + 0.5)])
 
 
 @jit
 def _depths(position: Array, lattice: Lattice, depth: Array) -> None:
+    (low, spacing, distances, margin), slope = lattice, np.empty(position.shape[1])
     for p in range(position.shape[0]):
-        depth[p] = max(0.0, lattice.margin - _look_up(position[p, 0], position[p, 1], lattice)[0])
+        depth[p] = max(0.0, margin - _look_up(position[p], distances, low, spacing, slope))
 
 
 @jit
 def _push_out(before: Array, position: Array, velocity: Array, lower: Array, upper: Array, lattice: Lattice) -> int:
-    low, spacing, distances, margin = lattice
-    pushed = 0
+    (low, spacing, distances, margin), dim = lattice, position.shape[1]
+    pushed, slope, point = 0, np.empty(dim), np.empty(dim)
     for p in range(position.shape[0]):
-        x, y = position[p, 0], position[p, 1]
         # The nearest lattice point is within the margin of the particle: an early exit for most.
-        near = distances[int((x - low[0]) / spacing + 0.5), int((y - low[1]) / spacing + 0.5)]
-        if near > 2 * margin:
+        if _nearest(position[p], distances, low, spacing) > 2 * margin:
             continue
-        distance, sx, sy = _look_up(x, y, lattice)
+        point[:] = position[p]
+        distance = _look_up(point, distances, low, spacing, slope)
         if distance >= margin:
             continue
         pushed += 1
         for _ in range(_PUSHES):
-            length = math.sqrt(sx * sx + sy * sy)
-            if length == 0:
+            square = 0.0
+            for axis in range(dim):
+                square += slope[axis] * slope[axis]
+            if square == 0:
                 break
-            sx, sy = sx / length, sy / length
-            inwards = min(0.0, velocity[p, 0] * sx + velocity[p, 1] * sy)
-            velocity[p, 0] -= inwards * sx
-            velocity[p, 1] -= inwards * sy
             # A little further than needed, so that rounding does not leave it inside the margin.
-            step = 1.001 * (margin - distance)
-            x = min(max(x + step * sx, lower[0]), upper[0])
-            y = min(max(y + step * sy, lower[1]), upper[1])
-            distance, sx, sy = _look_up(x, y, lattice)
+            length, step, inwards = math.sqrt(square), 1.001 * (margin - distance), 0.0
+            for axis in range(dim):
+                slope[axis] /= length
+                inwards += velocity[p, axis] * slope[axis]
+            for axis in range(dim):
+                velocity[p, axis] -= min(0.0, inwards) * slope[axis]
+                point[axis] = min(max(point[axis] + step * slope[axis], lower[axis]), upper[axis])
+            distance = _look_up(point, distances, low, spacing, slope)
             if distance >= margin:
                 break
         if distance < margin:
-            x, y = before[p, 0], before[p, 1]
-            velocity[p, 0] = velocity[p, 1] = 0.0
-        position[p, 0], position[p, 1] = x, y
+            point[:] = before[p]
+            velocity[p] = 0.0
+        position[p] = point
     return pushed

@@ -15,7 +15,6 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.utilities import rank_zero_warn
 from torch import Tensor
 
-from nmpm._support.collectives import any_rank
 from nmpm.errors import NmpmError
 
 RECENT = 10
@@ -50,7 +49,7 @@ class DivergenceGuard(Callback):
         value = float(loss) if isinstance(loss, Tensor) else None
         broken = value is not None and not math.isfinite(value)
         # All ranks stop together: one that raised alone would leave the others waiting in their next collective.
-        if any_rank(broken, trainer.strategy.root_device):
+        if trainer.strategy.reduce_boolean_decision(broken, all=False):
             raise self._diverged_error(
                 trainer, f"the loss is {value}" if broken else "the loss of another rank is not finite"
             )
@@ -85,7 +84,7 @@ class DivergenceGuard(Callback):
     def _check_weights(self, trainer: Trainer, weights: Iterable[tuple[str, Tensor]]) -> None:
         """Called on all ranks; a rank that holds no weights, as under sharding, has nothing to report."""
         broken = next((name for name, values in weights if not torch.isfinite(values).all()), None)
-        if any_rank(broken is not None, trainer.strategy.root_device):
+        if trainer.strategy.reduce_boolean_decision(broken is not None, all=False):
             raise self._diverged_error(trainer, f"the weights {broken or 'of another rank'} are not finite")
 
     def _diverged_error(self, trainer: Trainer, what: str) -> DivergedError:

@@ -10,9 +10,8 @@ from typing import Any
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from nmpm._support.collectives import broadcast_from_rank0
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.data.loading.evaluation import EvaluationLoader
+from nmpm.data.recordings import EvaluationLoader
 from nmpm.particles import Window
 from nmpm.training.budget import (
     lengthen_validation_interval,
@@ -64,7 +63,7 @@ class Forecast(Callback):
         self._seconds.append(self._since - former)
         if len(self._seconds) == SKIPPED + MEASURED:
             pace = statistics.median(self._seconds[SKIPPED:])
-            self._decide(trainer, pl_module, broadcast_from_rank0(pace, trainer.strategy.root_device))
+            self._decide(trainer, pl_module, trainer.strategy.broadcast(pace))
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self._since, self._validation_start = math.nan, time.monotonic()

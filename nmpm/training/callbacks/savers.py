@@ -16,7 +16,6 @@ from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities import rank_zero_info, rank_zero_warn
 from torch import Tensor
 
-from nmpm._support.collectives import any_rank
 from nmpm.errors import DataError
 from nmpm.training.checkpoints import read_checkpoint
 from nmpm.training.preflight import OVERALL
@@ -185,7 +184,7 @@ class LastCheckpoint(ModelCheckpoint):
         self._stop_handling()
 
     def _stop_if_requested(self, trainer: Trainer) -> None:
-        if any_rank(self._requested, trainer.strategy.root_device):
+        if trainer.strategy.reduce_boolean_decision(self._requested, all=False):
             self._save(trainer)
             raise KeyboardInterrupt
 

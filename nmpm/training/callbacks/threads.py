@@ -7,17 +7,11 @@ from typing import Any
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 
-from nmpm._support.devices import processor_name
+from nmpm._support.machine import processor_name
 from nmpm._support.threads import ThreadChoice, usable_cores
 from nmpm.particles import Window
 from nmpm.training.backpropagation import MOST_PARTS
 from nmpm.training.module import EmulatorModule
-
-THREADS = (
-    "Of a CPU, which compute parts of a batch (default: OMP_NUM_THREADS; else the faster of one and all that may be"
-    " used, as measured). Another number changes results by rounding."
-)
-"""Help of the option."""
 
 
 class Threads(Callback):

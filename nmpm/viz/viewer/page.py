@@ -9,6 +9,7 @@ import base64
 import html
 import json
 import zlib
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -70,18 +71,12 @@ class ViewerPage:
         if every < 1:
             raise ConfigError(f"every = {every} must be at least 1.")
         data = json.dumps(_describe(trajectories, every), separators=(",", ":"), allow_nan=False)
-
-        def read(name: str) -> str:
-            return files(__package__).joinpath(name).read_text(encoding="utf-8")
-
-        self.html = read("page.html")
-        for mark, content in {
-            "/*STYLE*/": read("style.css"),
-            "/*SCRIPT*/": "\n".join(map(read, SCRIPTS)),
+        contents = {
+            "/*STYLE*/": read_asset("style.css"),
+            "/*SCRIPT*/": "\n".join(map(read_asset, SCRIPTS)),
             "/*DATA*/": data.replace("<", "\\u003c"),  # `</script>` in a text would end the data
-        }.items():
-            before, after = self.html.split(mark)
-            self.html = before + content + after
+        }
+        self.html = fill_page(read_asset("page.html"), contents)
 
     def write(self, path: Path | str) -> Path:
         """Writes the page to a `.html` file; an existing one is replaced only when the new one is complete.
@@ -100,6 +95,19 @@ class ViewerPage:
         page = html.escape(self.html, quote=True)
         allowed, style = "allow-scripts allow-downloads", "width: 100%; height: 640px; border: 0"
         return f'<iframe srcdoc="{page}" sandbox="{allowed}" style="{style}"></iframe>'
+
+
+def read_asset(name: str, package: str = __package__) -> str:
+    """The text of a file of a package, of the viewer's when left out."""
+    return files(package).joinpath(name).read_text(encoding="utf-8")
+
+
+def fill_page(text: str, contents: Mapping[str, str]) -> str:
+    """A page's text with contents in place of their marks, each of which stands there once."""
+    for mark, content in contents.items():
+        before, after = text.split(mark)
+        text = before + content + after
+    return text
 
 
 def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
@@ -232,9 +240,9 @@ def _nearly_largest(trajectories: LabelledTrajectories, differences: list[Floats
     """Nearly the largest length of differences (..., D), the shortest ones where axes are periodic; 1 for none."""
     if not differences:
         return 1.0
-    period, stacked = np.array(trajectories.periods), np.concatenate(differences)
-    stacked = stacked - period * np.round(stacked / np.where(period > 0, period, 1.0))
-    lengths = np.sqrt(np.square(stacked).sum(axis=-1))
+    stacked = np.concatenate(differences)
+    shortest = [trajectories.shortest(stacked[..., axis], axis) for axis in range(trajectories.dim)]
+    lengths = np.sqrt(np.square(shortest).sum(axis=0))
     lengths = lengths[~np.isnan(lengths)]
     return (float(np.percentile(lengths, TOP_PERCENTILE)) if lengths.size else 0.0) or 1.0
 

@@ -26,7 +26,7 @@ from nmpm._support.atomic import atomic_write
 from nmpm._support.messages import install
 from nmpm._support.version import __version__
 from nmpm.errors import ConfigError
-from nmpm.transfer.execution import without_kernels
+from nmpm.transfer import without_kernels
 from nmpm.zoo.export.parts import VARYING, Part, Value
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from nmpm.data.split_files import split_paths
+from nmpm.data.format import split_paths
 from nmpm.emulator import Prescribed
 from nmpm.evaluation.ensembles import EnsembleTest
 from nmpm.particles import Window

@@ -10,13 +10,10 @@ from typing import Any
 
 from nmpm._support.messages import one_line
 from nmpm._support.progress import progress_bar
-from nmpm.data.format import Split, Trajectory, read_metadata
-from nmpm.data.generate import preset_metadata
-from nmpm.data.loading.evaluation import EvaluationLoader
-from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.recording import Recording, RecordingReader, SplitRecordings
-from nmpm.data.simulation import SimulationRequest, same_test_scenes
-from nmpm.data.split_files import find_split
+from nmpm.data.format import Split, Trajectory, find_split, read_metadata
+from nmpm.data.recordings import EvaluationLoader, RecordingReader, SplitRecordings
+from nmpm.data.simulation import SimulationRequest, preset_metadata, same_test_scenes
+from nmpm.data.windows import Recording, collate
 from nmpm.errors import ConfigError, ZooError
 from nmpm.particles import Window
 from nmpm.scene import Reading

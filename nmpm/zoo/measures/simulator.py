@@ -15,7 +15,7 @@ import numpy as np
 from nmpm.errors import UnstableError
 from nmpm.metrics import MSE
 from nmpm.sim import SimulatedTrajectory
-from nmpm.sim.predictability import nudge, twin_of
+from nmpm.sim.preset import nudge, twin_of
 from nmpm.zoo.measures.scenes import as_recording, iterate_scenes, simulation_of
 from nmpm.zoo.pretrained import Pretrained
 

@@ -7,13 +7,13 @@ import statistics
 from pathlib import Path
 from typing import Any
 
-from nmpm._support.devices import device_name
+from nmpm._support.machine import device_name
 from nmpm._support.messages import one_line
 from nmpm.emulator import rollout
 from nmpm.errors import ZooError
 from nmpm.evaluation.machine import peak_bytes, wall_clock
 from nmpm.particles import Particles
-from nmpm.zoo.entry_files import read_card
+from nmpm.zoo.card import read_card
 from nmpm.zoo.optimization import fitting_count
 from nmpm.zoo.pretrained import Pretrained
 

@@ -1,5 +1,7 @@
 """Rules that hold in every reader, whatever the form of the files."""
 
+import re
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -7,8 +9,10 @@ import h5py
 import numpy as np
 import pytest
 
+from nmpm._support.messages import install
 from nmpm.data.convert import convert, open_dataset
 from nmpm.data.format import Split, Trajectory
+from nmpm.errors import ConfigError
 
 T, N = 12, 6
 Arrays = Mapping[str, np.ndarray]
@@ -236,3 +240,18 @@ def test_ids_may_be_texts(tmp_path, name):
     run = read(WRITERS[name](tmp_path / name, made(), {"id": ids}))
     column = [run.ids("S")[0].tolist().index(label) for label in ids]
     np.testing.assert_allclose(run.position[:, column], made(), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "package", "extra"),
+    [
+        ("vtk", "vtkmodules", "pyvista", "vtk"), ("ply", "plyfile", "plyfile", "vtk"), ("gsd", "gsd", "gsd", "gsd"),
+        ("parquet", "pyarrow", "pyarrow", "tables"),
+    ],
+)  # fmt: skip
+def test_a_missing_package_gives_the_install_command(tmp_path, monkeypatch, name, module, package, extra):
+    path = tmp_path / f"run.{name}"
+    path.write_bytes(b"any content")
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ConfigError, match=rf"run.{name}: reading \w+ needs {package}: {re.escape(install(extra))}\.$"):
+        open_dataset(path)

@@ -9,7 +9,7 @@ import pytest
 from nmpm.data.convert import Options, convert, open_dataset
 from nmpm.data.format import Split, read_metadata
 from nmpm.data.inspection import inspect
-from nmpm.data.loading.sources import FolderSource
+from nmpm.data.sources import FolderSource
 from nmpm.errors import ConfigError, DataError
 
 FRAMES, PARTICLES = 12, 5

@@ -5,7 +5,7 @@ import pytest
 
 import nmpm
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.loading.sources import FolderSource
+from nmpm.data.sources import FolderSource
 from nmpm.errors import ConfigError, DataError
 
 SCENE = nmpm.Scene(

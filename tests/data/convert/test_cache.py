@@ -6,7 +6,7 @@ import pytest
 from nmpm.data.convert import Options, native_folder
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import read_metadata
-from nmpm.data.loading.sources import FolderSource
+from nmpm.data.sources import FolderSource
 from nmpm.errors import ConfigError
 from tests.data.convert import records
 

@@ -101,7 +101,7 @@ def test_unknown_types_and_formats_are_refused_with_a_suggestion(tmp_path):
         convert(tmp_path, tmp_path / "out")
     with pytest.raises(DataError, match="no such file or folder"):
         convert(tmp_path / "nowhere", tmp_path / "out")
-    with pytest.raises(ConfigError, match="No format is called 'tf'"):
+    with pytest.raises(ConfigError, match="There is no format 'tf'; there are native, deepmind"):
         convert(tmp_path, tmp_path / "out", "tf")
 
 

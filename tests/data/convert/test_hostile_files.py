@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from nmpm.data.convert import Options, convert, open_dataset
-from nmpm.data.convert.restricted_pickle import load_pickled
+from nmpm.data.convert.pickles import load_pickled
 from nmpm.data.format import Split, read_metadata
 from nmpm.errors import DataError
 from tests.data.convert import records

@@ -11,7 +11,7 @@ import pytest
 from nmpm.data.convert import Options, convert
 from nmpm.data.format import Split, read_metadata
 from nmpm.data.inspection import inspect
-from nmpm.data.loading.sources import FolderSource
+from nmpm.data.sources import FolderSource
 from nmpm.errors import DataError
 
 T, N = 6, 5
@@ -157,7 +157,10 @@ GOOD = frame_text(0, [(1, 0.1, 0.2), (2, 0.3, 0.4)], "id x y")
         (GOOD.replace("2 0.3", "1 0.3").replace("\n0\n", "\n7\n"), "frame 1: 2 particles have the id 1"),
         (GOOD.replace("0.3", "nan").replace("\n0\n", "\n7\n"), r"frame 1: position of particle 1 is \[nan, 0.4\]"),
         (GOOD.replace("id x y", "id q r").replace("\n0\n", "\n7\n"), "timestep 7: no columns x y, .*found: id q r"),
-        (GOOD.replace("0.1", "abc").replace("\n0\n", "\n7\n"), "timestep 7: the columns x y must contain numbers"),
+        (
+            GOOD.replace("0.1", "abc").replace("\n0\n", "\n7\n"),
+            "timestep 7: the column x must contain numbers, but has 'abc'",
+        ),
         (
             GOOD.replace("1 0.1 0.2", "a 0.1 0.2").replace("2 0.3 0.4", "").replace("\n0\n", "\n7\n"),
             "line 22 or before: an empty",
@@ -166,20 +169,10 @@ GOOD = frame_text(0, [(1, 0.1, 0.2), (2, 0.3, 0.4)], "id x y")
         ("something else\n", "line 12 is 'something else'; expected ITEM: TIMESTEP"),
     ],
     ids=[
-        "triclinic",
-        "missing",
-        "cut",
-        "header",
-        "text",
-        "twice",
-        "nan",
-        "columns",
-        "no numbers",
-        "empty line",
-        "flags",
+        "triclinic", "missing", "cut", "header", "text", "twice", "nan", "columns", "no numbers", "empty line", "flags",
         "other",
     ],
-)
+)  # fmt: skip
 def test_damaged_dumps_are_named(tmp_path, second, message):
     (tmp_path / "run.lammpstrj").write_text(GOOD + second)
     with pytest.raises(DataError, match=f"run.lammpstrj.*{message}"):

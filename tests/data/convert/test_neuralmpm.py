@@ -8,7 +8,7 @@ import pytest
 
 from nmpm.data.convert import Options, convert
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.loading.sources import FolderSource
+from nmpm.data.sources import FolderSource
 from nmpm.errors import DataError
 
 

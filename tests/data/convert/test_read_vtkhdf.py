@@ -8,7 +8,7 @@ import pytest
 
 from nmpm.data.convert import convert
 from nmpm.data.format import Split, Trajectory, read_metadata
-from nmpm.data.write.vtkhdf import write_viewable
+from nmpm.data.write.vtk import write_viewable
 from nmpm.errors import DataError
 
 T, N = 4, 6

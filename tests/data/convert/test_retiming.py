@@ -7,7 +7,7 @@ from nmpm.data.convert import Options, convert
 from nmpm.data.convert.retiming import resample, smooth
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split, Trajectory, read_metadata, write_metadata, write_split
-from nmpm.data.loading.sources import FolderSource
+from nmpm.data.sources import FolderSource
 from nmpm.data.times import uneven_step, usual_step
 from nmpm.errors import ConfigError, DataError
 from tests.made_up import made_up_metadata

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from nmpm.data.convert import convert
-from nmpm.data.convert.restricted_pickle import load_pickled
+from nmpm.data.convert.pickles import load_pickled
 from nmpm.data.format import Split
 from nmpm.errors import DataError
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nmpm.data.convert.tfrecord import crc32c, masked_crc, read_record, record_offsets
+from nmpm.data.convert.deepmind import crc32c, masked_crc, read_record, record_offsets
 from nmpm.errors import DataError
 from tests.data.convert import records
 

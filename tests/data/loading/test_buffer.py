@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from nmpm._support.threads import raise_if_abandoned
+from nmpm.data.batches import MotionSampler, TrajectoryBuffer, WindowPlan
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.loading.buffer import MotionSampler, TrajectoryBuffer
-from nmpm.data.loading.recording import Recording, SplitRecordings
-from nmpm.data.loading.window_plan import WindowPlan
+from nmpm.data.recordings import SplitRecordings
 from nmpm.data.scene_inference import infer_scene
+from nmpm.data.windows import Recording
 from nmpm.errors import DataError
 from nmpm.scene import Reading, Scene
 

@@ -11,10 +11,9 @@ import torch
 
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import Split, Trajectory, write_metadata, write_split
-from nmpm.data.loading.model_frames import model_velocity
-from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.recording import SplitRecordings
-from nmpm.data.loading.sources import FolderSource
+from nmpm.data.recordings import SplitRecordings
+from nmpm.data.sources import FolderSource
+from nmpm.data.windows import collate, model_velocity
 from nmpm.errors import ConfigError, DataError
 from nmpm.evaluation.comparison import free_fall
 from nmpm.particles import Window

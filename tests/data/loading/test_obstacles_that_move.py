@@ -6,10 +6,10 @@ import torch
 
 from nmpm.data.convert import Options, convert
 from nmpm.data.format import Split, Trajectory, read_metadata, write_metadata, write_split
-from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.recording import SplitRecordings
-from nmpm.data.loading.sources import FolderSource
+from nmpm.data.recordings import SplitRecordings
 from nmpm.data.scene_inference import infer_scene
+from nmpm.data.sources import FolderSource
+from nmpm.data.windows import collate
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Reading
 from tests.made_up import made_up_metadata, made_up_trajectory

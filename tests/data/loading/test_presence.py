@@ -8,13 +8,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nmpm.data.batches import TrajectoryBuffer, WindowPlan
 from nmpm.data.format import Split, Trajectory, read_metadata, write_metadata, write_split
-from nmpm.data.loading.buffer import TrajectoryBuffer
-from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.presence import Presence, find_tracks, first_frames
-from nmpm.data.loading.recording import SplitRecordings
-from nmpm.data.loading.window_plan import WindowPlan
+from nmpm.data.recordings import SplitRecordings
 from nmpm.data.scene_inference import infer_scene
+from nmpm.data.windows import Presence, collate, find_tracks, first_frames
 from nmpm.errors import DataError
 from nmpm.scene import Reading
 from tests.made_up import made_up_metadata, made_up_trajectory

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from nmpm.data.convert import Options
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.loading.padded_batch import unwrap
-from nmpm.data.loading.recording import SplitRecordings
+from nmpm.data.recordings import SplitRecordings
 from nmpm.data.scene_inference import infer_scene
+from nmpm.data.windows import unwrap
 from nmpm.errors import DataError
 from nmpm.scene import Reading, Scene
 

@@ -6,11 +6,10 @@ import pytest
 import torch
 
 from nmpm._support.threads import AbandonedError, Task
+from nmpm.data.batches import EndlessWindowPlan, TrajectoryBuffer
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.data.loading.buffer import TrajectoryBuffer
-from nmpm.data.loading.padded_batch import collate
-from nmpm.data.loading.simulated import SimulatedRecordings
-from nmpm.data.loading.window_plan import EndlessWindowPlan
+from nmpm.data.simulated_sources import SimulatedRecordings
+from nmpm.data.windows import collate
 from nmpm.errors import ConfigError
 from nmpm.scene import Reading
 from nmpm.sim import MpmPreset, load_preset

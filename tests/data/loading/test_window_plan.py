@@ -8,7 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from nmpm.data.loading.window_plan import OPENING, WindowPlan
+from nmpm.data.batches import OPENING, WindowPlan
 from nmpm.errors import ConfigError
 
 PLANS = st.builds(

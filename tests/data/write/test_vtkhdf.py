@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nmpm.data.format import Split, Trajectory
-from nmpm.data.write.vtkhdf import write_viewable
+from nmpm.data.write.vtk import write_viewable
 
 TYPES = np.array([7, 7, 7, 3])
 

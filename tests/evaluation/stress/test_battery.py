@@ -8,19 +8,19 @@ import pytest
 import torch
 from scenes import box, cloud
 
-from nmpm.data.initial_states import lattice, state_at_rest
 from nmpm.data.simulation import seed_of_draw
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
-from nmpm.emulator.input_checks import beyond_walls
+from nmpm.emulator.monitor import beyond_walls
 from nmpm.emulator.similarity import find_match
 from nmpm.errors import UnstableError
 from nmpm.evaluation.stress import GROUPS, Effort, ModelUnderTest, battery, results
 from nmpm.evaluation.stress.model import simulate_beside, simulate_window
 from nmpm.evaluation.stress.trace import energy_above_lowest, filled_volume, is_lost, rms_distance, trace_bundles
+from nmpm.particles import lattice, state_at_rest
 from nmpm.processors import Pointwise
 from nmpm.sim import MpmPreset, load_preset
-from nmpm.sim.predictability import twin_of
+from nmpm.sim.preset import twin_of
 
 TINY = Effort(
     scenes=1, horizons=2, far=16, settling=1, settled=16, compared=8, particles=100, bundles=4, settling_scenes=2,

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import torch
 
-from nmpm.data.generate import generate
-from nmpm.data.loading.recording import Recording
-from nmpm.data.loading.sources import FolderSource
+from nmpm.data.simulation import generate
+from nmpm.data.sources import FolderSource
+from nmpm.data.windows import Recording
 from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.constraints import Constraints
 from nmpm.evaluation.trade import Kind, Point, Scenes, Sweep, read_scenes, read_sweep

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from nmpm._support.digests import short_digest
+from nmpm._support.digests import weights_digest
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.trade import (
     Kind,
@@ -15,12 +15,11 @@ from nmpm.evaluation.trade import (
     find_factory,
     find_wider_scenes,
     make_choices,
-    model_settings,
     read_sweep,
     shipped_sweep_text,
 )
 from nmpm.evaluation.trade.choices import CPU, follow_nearest
-from nmpm.evaluation.trade.model_settings import ModelSettings
+from nmpm.evaluation.trade.sweep import ModelSettings
 from nmpm.sim import load_preset
 from tests.evaluation.trade.made_up import tiny_emulator, tiny_sweep
 
@@ -101,7 +100,7 @@ def test_a_model_of_other_scenes_gets_cells_of_the_same_size_and_is_named_so(sce
     )
     models = [c for c in make_choices(tiny_sweep(), scenes, {"one": narrow}) if c.kind is Kind.MODEL]
     assert {choice.settings["model"] for choice in models} == {"one (of other scenes)"}
-    assert {choice.settings["weights"] for choice in models} == {short_digest(narrow.state_dict())}
+    assert {choice.settings["weights"] for choice in models} == {weights_digest(narrow.state_dict())[:12]}
     assert "domain" in models[0].settings["scenes_differ_in"]
     assert (narrow.grid.shape, models[0].emulator.grid.shape) == ((4, 8), (8, 8))
 
@@ -135,8 +134,8 @@ def test_runtimes_are_choices_of_their_own(scenes):
 
 @pytest.mark.parametrize(("emulated", "installed"), [(True, True), (False, True), (True, False)])
 def test_emulated_precisions_are_left_out_and_installed_runtimes_take_part(scenes, monkeypatch, emulated, installed):
-    monkeypatch.setattr(model_settings, "computes_bfloat16", lambda _: not emulated)
-    monkeypatch.setattr(model_settings, "find_spec", lambda name: name if installed else None)
+    monkeypatch.setattr("nmpm.evaluation.trade.sweep.computes_bfloat16", lambda _: not emulated)
+    monkeypatch.setattr("nmpm.evaluation.trade.sweep.find_spec", lambda name: name if installed else None)
     settings = ModelSettings(constraints=("held",), batch=(1,))
     sweep = dataclasses.replace(tiny_sweep(), models=settings)
     choices = make_choices(sweep, scenes, {"carried": tiny_emulator(scenes.scene)})

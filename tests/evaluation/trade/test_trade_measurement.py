@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from nmpm.data.loading.recording import Recording
+from nmpm.data.windows import Recording
 from nmpm.emulator import rollout
 from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import free_fall

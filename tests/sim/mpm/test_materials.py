@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.errors import ConfigError
-from nmpm.sim.mpm.solids import Goop, Sand
-from nmpm.sim.mpm.water import Water
+from nmpm.sim.mpm.materials import Goop, Sand, Water
 
 GOOP = Goop(density=1000.0, young=4e5, poisson=0.4, yield_stress=200.0, viscosity=60.0)
 SAND = Sand(density=1000.0, young=3.5e5, poisson=0.3, friction_angle=30.0)

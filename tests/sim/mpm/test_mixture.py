@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from nmpm.data.format import Trajectory
-from nmpm.data.generate import preset_metadata
-from nmpm.data.loading.recording import RecordingReader
+from nmpm.data.recordings import RecordingReader
+from nmpm.data.simulation import preset_metadata
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Reading
 from nmpm.sim import InitialState, load_preset, preset_from_dict
-from nmpm.sim.predictability import twin_of
-from nmpm.sim.preset import BOUNDARY
+from nmpm.sim.preset import BOUNDARY, twin_of
 
 UNIVERSAL = load_preset("universal")
 STARTS = [UNIVERSAL.draw(seed) for seed in range(12)]

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from nmpm.sim import InitialState, load_preset
-from nmpm.sim.mpm.solids import Sand
-from nmpm.sim.mpm.water import Water
+from nmpm.sim.mpm.materials import Sand, Water
 
 GOOP = load_preset("goop")
 

@@ -7,10 +7,9 @@ from hypothesis import strategies as st
 
 from nmpm.errors import DataError
 from nmpm.sim.mpm.layouts import SimulatedRamp
+from nmpm.sim.mpm.materials import Goop, Sand, Water
 from nmpm.sim.mpm.obstacle_field import ObstacleField
-from nmpm.sim.mpm.solids import Goop, Sand
 from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, MpmStepper
-from nmpm.sim.mpm.water import Water
 
 SIZE, CELLS, DT = 0.0125, 48, 2e-4
 WATER = Water(density=1000.0, bulk_modulus=7e4)

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from columns import at_rest, lattice, run, tank
 
-from nmpm.sim.mpm.solids import Goop, Sand
+from nmpm.sim.mpm.materials import Goop, Sand, Water
 from nmpm.sim.mpm.stepper import Walls
-from nmpm.sim.mpm.water import Water
 
 SIZE = 0.0125
 ANGLES = (20.0, 30.0, 40.0)

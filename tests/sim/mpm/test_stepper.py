@@ -8,9 +8,8 @@ from columns import at_rest, lattice, run, tank
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nmpm.sim.mpm.solids import Goop, Sand
+from nmpm.sim.mpm.materials import Goop, Sand, Water
 from nmpm.sim.mpm.stepper import MpmGrid, MpmParticles, MpmStepper, Walls
-from nmpm.sim.mpm.water import Water
 
 SIZE = 0.025
 WATER = Water(density=1000.0, bulk_modulus=7e4)

@@ -14,7 +14,7 @@ from nmpm.sim.sph.boundary import (
     box_particles,
     obstacle_particles,
 )
-from nmpm.sim.sph.layouts import Column, FluidBlocks
+from nmpm.sim.sph.preset import Column, FluidBlocks
 
 SQUARE = PolygonObstacle(np.array([[0.4, 0.4], [0.6, 0.4], [0.6, 0.6], [0.4, 0.6]]))
 TRIANGLE = PolygonObstacle(np.array([[0.3, 0.2], [0.8, 0.3], [0.7, 0.7]]))

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.integrate import quad
 
-from nmpm.sim.sph.neighbours import PairLists
-from nmpm.sim.sph.sums import NORM, SUPPORT, expansion, pair_geometry, push, slope, weight
+from nmpm.sim.sph.wcsph import NORM, SUPPORT, PairLists, expansion, pair_geometry, push, slope, weight
 
 LOW, HIGH = np.array([-0.3, 0.1]), np.array([0.9, 0.8])
 

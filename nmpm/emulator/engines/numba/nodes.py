@@ -1,4 +1,4 @@
-"""The nodes that a position touches along an axis, and their weights, as in `nmpm.transfer.linear` and `quadratic`.
+"""The nodes that a position touches along an axis, and their weights, as in `nmpm.transfer` and `quadratic`.
 
 Non-finite positions are handled as each transfer does: they must not become indices.
 """

@@ -15,7 +15,7 @@ from nmpm._support.threads import map_ranges, split
 from nmpm.emulator.engines.numba.parameters import Array, KernelParameters
 from nmpm.emulator.engines.numba.scatter import scatter
 from nmpm.emulator.engines.numba.solids import SolidCache
-from nmpm.transfer.transfer import LEAST_SHARE
+from nmpm.transfer import LEAST_SHARE
 
 _CHUNK = 2**16  # particles; each chunk has a grid of its own, so that sums do not depend on the number of threads
 _BLOCK = 64  # nodes

@@ -27,7 +27,7 @@ from nmpm.emulator.engines.torch.advection import BundleStart
 from nmpm.emulator.engines.torch.engine import TorchEngine
 from nmpm.emulator.rasterise import solid_channels
 from nmpm.particles import Particles, scene_volumes
-from nmpm.transfer.transfer import LEAST_SHARE
+from nmpm.transfer import LEAST_SHARE
 
 ZERO, ONE = np.float32(0), np.float32(1)
 

@@ -18,8 +18,7 @@ from nmpm.emulator.engines.torch.crowding import Crowding
 from nmpm.emulator.engines.torch.energy import EnergyLimit
 from nmpm.emulator.engines.torch.support import Support, drops
 from nmpm.particles import Particles
-from nmpm.transfer.execution import is_eager_cpu
-from nmpm.transfer.linear import linear_g2p
+from nmpm.transfer import is_eager_cpu, linear_g2p
 
 if TYPE_CHECKING:
     from nmpm.emulator.model import Emulator

@@ -19,8 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from nmpm.grid import Grid
-from nmpm.transfer.execution import chunks, is_eager_cpu
-from nmpm.transfer.linear import linear_g2p
+from nmpm.transfer import chunks, is_eager_cpu, linear_g2p
 
 SURFACE = 0.4
 """Solid fraction at an obstacle's surface: walls of one cell reach 0.5 at least, wherever they lie between nodes."""

@@ -20,9 +20,7 @@ import torch
 from torch import Tensor
 
 from nmpm.grid import Grid
-from nmpm.transfer import Linear
-from nmpm.transfer.execution import is_eager_cpu
-from nmpm.transfer.linear import linear_g2p
+from nmpm.transfer import Linear, is_eager_cpu, linear_g2p
 
 MAX_SHIFT = 0.5
 """Cells that a particle moves along an axis at most: an obstacle of one cell cannot be jumped over."""

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from nmpm.emulator.constraints import energy
-from nmpm.transfer.execution import is_eager_cpu
+from nmpm.transfer import is_eager_cpu
 
 
 @dataclass(frozen=True)

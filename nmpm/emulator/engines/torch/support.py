@@ -19,7 +19,7 @@ from torch.nn import functional
 from nmpm.emulator.engines.torch.contact import SURFACE
 from nmpm.grid import Grid
 from nmpm.scene import Scene
-from nmpm.transfer.linear import linear_g2p
+from nmpm.transfer import linear_g2p
 
 REACH = 2
 """Empty cells between two bearing ones that break the support; settled water in layers leaves every other row empty."""
