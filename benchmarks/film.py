@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from timing import make_parser
 
-from nmpm._support.colours import BACKGROUND, FAINT_TEXT, OBSTACLE, TEXT, Rgb, material_colours
+from nmpm.colours import BACKGROUND, FAINT_TEXT, OBSTACLE, TEXT, Rgb, material_colours
 from nmpm.data.format import Split
 from nmpm.evaluation.trade.ranking import Setting, at_equal_error
 from nmpm.viz.animation import _write_gif

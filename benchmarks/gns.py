@@ -25,12 +25,12 @@ from graph_network import HISTORY, GraphSimulator, Neighbours, extend_back
 from torch import Tensor
 
 from nmpm._support.atomic import atomic_write
-from nmpm._support.digests import weights_digest
 from nmpm.data.catalog import ensure
 from nmpm.data.format import Split, read_metadata
 from nmpm.data.recordings import SplitRecordings
 from nmpm.data.scene_inference import infer_scene
 from nmpm.data.windows import Recording
+from nmpm.emulator.digests import weights_digest
 from nmpm.errors import ConfigError, DataError
 from nmpm.particles import Particles
 from nmpm.scene import Reading, Scene

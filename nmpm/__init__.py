@@ -6,7 +6,7 @@ The public names are imported when first used, so that `import nmpm` costs nothi
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from nmpm._support.version import __version__
+from nmpm._support import __version__
 
 if TYPE_CHECKING:
     from nmpm.data.datamodule import TrajectoryDataModule as TrajectoryDataModule

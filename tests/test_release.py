@@ -16,7 +16,7 @@ TEMPLATES = sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("[!c]*.yml"))
 
 def test_the_version_is_the_same_everywhere():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    assert project["tool"]["hatch"]["version"]["path"] == "nmpm/_support/version.py"
+    assert project["tool"]["hatch"]["version"]["path"] == "nmpm/_support/__init__.py"
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == __version__
     versions = re.findall(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     assert next(version for version in versions if version != "Unreleased") == __version__

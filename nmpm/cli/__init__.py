@@ -8,9 +8,9 @@ import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 
+from nmpm._support import __version__
 from nmpm._support.messages import plain_warnings, unfailing_output
 from nmpm._support.threads import limit_spinning
-from nmpm._support.version import __version__
 from nmpm.cli.command import Command, run_command, summary
 from nmpm.errors import NmpmError
 from nmpm.registry import Registry

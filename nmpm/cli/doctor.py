@@ -14,11 +14,11 @@ from functools import partial
 from importlib import metadata
 from pathlib import Path
 
+from nmpm._support import __version__
 from nmpm._support.machine import free_memory
 from nmpm._support.messages import one_line
 from nmpm._support.shipped import PACKAGE, user_home
 from nmpm._support.threads import usable_cores
-from nmpm._support.version import __version__
 from nmpm.cli.command import Command
 from nmpm.cli.options import check_device
 

@@ -36,7 +36,6 @@ from yaml import YAMLError
 from nmpm import decoders, metrics, optimizers, processors, transfer
 from nmpm._support.atomic import atomic_write
 from nmpm._support.bounded_files import check_yaml
-from nmpm._support.collectives import RankWatch, is_lost_connection
 from nmpm._support.machine import device_name, find_device
 from nmpm._support.messages import one_line, plain_warnings
 from nmpm._support.plain_data import load_plugins
@@ -66,6 +65,7 @@ from nmpm.training.checkpoints import AtomicCheckpointIO, read_checkpoint
 from nmpm.training.module import EmulatorModule
 from nmpm.training.optimization import check_learning_rate
 from nmpm.training.preflight import check_disk, check_memory, fitting_precision
+from nmpm.training.rank_watch import RankWatch, is_lost_connection
 
 REMARKS = re.compile(
     r"(\[rank: \d+\] )?Seed set to"

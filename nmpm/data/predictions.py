@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from nmpm._support.version import __version__
+from nmpm._support import __version__
 from nmpm.data.format import TRUTH, Metadata, Trajectory
 from nmpm.data.metadata import JsonKeys, parse_json, scene_metadata
 from nmpm.data.stated import FAMILIES

@@ -35,12 +35,12 @@ from typing import Any, TypeVar
 import numpy as np
 from joblib.externals.loky import ProcessPoolExecutor, process_executor
 
+from nmpm._support import __version__
 from nmpm._support.atomic import atomic_write, lock_folder, temporary_files
 from nmpm._support.bounded_files import NPZ_ERRORS
 from nmpm._support.progress import progress_bar
 from nmpm._support.threads import map_ranges, usable_cores
 from nmpm._support.threads import split as split_ranges
-from nmpm._support.version import __version__
 from nmpm.data.format import (
     METADATA_FILE,
     SPLITS,

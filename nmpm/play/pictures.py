@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm._support.colours import hex_code, material_colours
+from nmpm.colours import hex_code, material_colours
 from nmpm.obstacles import Body
 from nmpm.scene import Scene
 from nmpm.viz.viewer.page import ABSENT, STEPS, colour_scale, quantize

@@ -13,10 +13,10 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from nmpm._support.atomic import atomic_write
-from nmpm._support.digests import weights_digest
 from nmpm._support.messages import one_line
 from nmpm._support.plain_data import class_path, to_plain
 from nmpm.emulator import EmulatorRecipe
+from nmpm.emulator.digests import weights_digest
 from nmpm.emulator.recipe import FORMAT
 from nmpm.errors import ConfigError, DataError, NmpmError
 from nmpm.scene import Scene

@@ -18,12 +18,12 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
 from nmpm._support.collectives import global_mean
-from nmpm._support.digests import weights_digest
 from nmpm._support.plain_data import class_path
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.adaptation import adapted, with_members
 from nmpm.emulator.calibration import calibrate, calibrate_unread, unread_inputs
+from nmpm.emulator.digests import weights_digest
 from nmpm.emulator.fields import warn_of_ignored
 from nmpm.emulator.noise import training_noise
 from nmpm.emulator.recipe import FORMAT, check_format

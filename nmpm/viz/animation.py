@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from nmpm._support.colours import BACKGROUND, FAINT_TEXT, INTERIOR, OBSTACLE, TEXT, WALL, Rgb, material_colours
 from nmpm._support.progress import progress_bar
+from nmpm.colours import BACKGROUND, FAINT_TEXT, INTERIOR, OBSTACLE, TEXT, WALL, Rgb, material_colours
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import fit_camera
 from nmpm.viz.charts import ChartStrip

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from nmpm._support.colours import TEXT, hex_code
+from nmpm.colours import TEXT, hex_code
 from nmpm.viz.occupancy import LEVELS, band_colours, ensemble_colour
 from nmpm.viz.quantities import BANDS, QuantityCurves, quantity_curves
 from nmpm.viz.trajectories import LabelledTrajectories

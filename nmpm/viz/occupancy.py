@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm._support.colours import INTERIOR, Rgb, material_colours
+from nmpm.colours import INTERIOR, Rgb, material_colours
 
 LEVELS = (0.1, 0.5, 0.9)
 """Shares of members at which the bands of a picture begin."""

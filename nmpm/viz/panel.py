@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from nmpm._support.colours import BACKGROUND, EDGE, INTERIOR, OBSTACLE, TEXT, WALL, material_colours
+from nmpm.colours import BACKGROUND, EDGE, INTERIOR, OBSTACLE, TEXT, WALL, material_colours
 from nmpm.viz.camera import Camera, box_corners, fit_camera, vertical_axis
 from nmpm.viz.occupancy import CELL, LEVELS, band_colours, occupied_share
 from nmpm.viz.trajectories import Floats, LabelledTrajectories

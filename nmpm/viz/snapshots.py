@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from nmpm._support.colours import FAINT_TEXT, TEXT, Rgb, hex_code, material_colours
+from nmpm.colours import FAINT_TEXT, TEXT, Rgb, hex_code, material_colours
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import fit_camera
 from nmpm.viz.charts import add_frame_axes, add_legend, draw_curves, legend_of_bands, legend_of_curves

@@ -18,11 +18,11 @@ from torch import Tensor
 
 from nmpm._support.atomic import atomic_folder
 from nmpm._support.bounded_files import to_yaml
-from nmpm._support.digests import float32_digest
 from nmpm._support.shipped import PACKAGE, shipped_folder, user_zoo
 from nmpm.data.simulation import in_short
 from nmpm.emulator import Emulator
 from nmpm.emulator.adaptation import adapted
+from nmpm.emulator.digests import float32_digest
 from nmpm.errors import ZooError
 from nmpm.training.checkpoints import load_module, read_checkpoint
 from nmpm.zoo.card import BEST, CARD, CONFIG, FORMAT, SCENES, WEIGHTS, intervals, stress_digest

@@ -3,7 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from nmpm._support.colours import INTERIOR, OBSTACLE, WALL, material_colours
+from nmpm.colours import INTERIOR, OBSTACLE, WALL, material_colours
 from nmpm.viz.animation import format_distance
 from nmpm.viz.camera import fit_camera
 from nmpm.viz.panel import PanelRenderer, format_time, particle_spacing

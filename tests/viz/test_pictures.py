@@ -14,8 +14,8 @@ import pytest
 import torch
 from PIL import Image, ImageSequence
 
-from nmpm._support.colours import BACKGROUND, INTERIOR, WALL, material_colours
 from nmpm.cli import main
+from nmpm.colours import BACKGROUND, INTERIOR, WALL, material_colours
 from nmpm.data.format import Split, Trajectory, write_split
 from nmpm.errors import ConfigError, DataError
 from nmpm.evaluation.pictures import labelled_trajectories

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nmpm._support.colours import FALLBACK_COLOURS, INTERIOR, OBSTACLE, material_colours
+from nmpm.colours import FALLBACK_COLOURS, INTERIOR, OBSTACLE, material_colours
 from nmpm.errors import DataError
 from nmpm.scene import Scene
 from nmpm.viz import LabelledTrajectories, material_names

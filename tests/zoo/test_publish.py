@@ -7,9 +7,9 @@ import torch
 from safetensors.torch import load
 
 from nmpm._support.bounded_files import read_yaml
-from nmpm._support.digests import float32_digest
 from nmpm._support.shipped import PACKAGE, shipped_folder
 from nmpm.emulator.adaptation import with_noise
+from nmpm.emulator.digests import float32_digest
 from nmpm.errors import ZooError
 from nmpm.training.module import EmulatorModule
 from nmpm.zoo import Zoo, publish

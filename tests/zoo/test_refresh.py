@@ -8,10 +8,10 @@ import pytest
 import yaml
 
 from nmpm._support.bounded_files import read_yaml
-from nmpm._support.digests import weights_digest
 from nmpm._support.shipped import shipped_folder
 from nmpm.cli import main
 from nmpm.emulator import members
+from nmpm.emulator.digests import weights_digest
 from nmpm.errors import ConfigError, UnstableError, ZooError
 from nmpm.evaluation.stress import QUICK, results
 from nmpm.evaluation.trade.ranking import Setting, at_equal_error

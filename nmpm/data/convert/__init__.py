@@ -13,9 +13,9 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
+from nmpm._support import __version__
 from nmpm._support.atomic import lock_folder
 from nmpm._support.shipped import user_home
-from nmpm._support.version import __version__
 from nmpm.data.convert.base import ForeignDataset as ForeignDataset
 from nmpm.data.convert.base import Options as Options
 from nmpm.data.convert.base import Reader as Reader

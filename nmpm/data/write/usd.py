@@ -11,7 +11,7 @@ from typing import IO, ClassVar
 
 import numpy as np
 
-from nmpm._support.colours import Rgb, material_colours
+from nmpm.colours import Rgb, material_colours
 from nmpm.data.format import TRUTH
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.write.base import Clip, ClipFrame, TextWriter, pad

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from nmpm._support.digests import weights_digest
 from nmpm._support.messages import one_line
 from nmpm.emulator import Emulator, Prescribed, rollout
+from nmpm.emulator.digests import weights_digest
 from nmpm.emulator.members import predict_members
 from nmpm.emulator.prescribed import predict_from_entries, with_predicted
 from nmpm.errors import ConfigError, DataError

@@ -17,11 +17,11 @@ from typing import Any, Literal
 import torch
 
 from nmpm._support.bounded_files import parse_yaml
-from nmpm._support.digests import weights_digest
 from nmpm._support.machine import computes_bfloat16
 from nmpm._support.messages import counted, install
 from nmpm._support.plain_data import from_plain
 from nmpm.emulator import NETWORK_PRECISIONS, Emulator
+from nmpm.emulator.digests import weights_digest
 from nmpm.emulator.members import nudge_of
 from nmpm.emulator.similarity import Match, find_match
 from nmpm.errors import ConfigError

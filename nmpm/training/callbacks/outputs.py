@@ -20,17 +20,17 @@ from lightning.pytorch.trainer.states import TrainerFn
 from rich.console import Console
 from torch import Tensor
 
+from nmpm._support import __version__
 from nmpm._support.atomic import atomic_write
 from nmpm._support.collectives import all_gather, gather_to_rank0, rank_and_world_size
-from nmpm._support.digests import float32_digest
 from nmpm._support.machine import device_name, join_hardware
 from nmpm._support.messages import one_line
-from nmpm._support.version import __version__
 from nmpm.data.format import Trajectory
 from nmpm.data.predictions import predicted_trajectory
 from nmpm.data.recordings import EvaluationLoader
 from nmpm.data.write.vtk import write_viewable
 from nmpm.emulator import Rollout
+from nmpm.emulator.digests import float32_digest
 from nmpm.evaluation.figures import ensemble_table, error_table, no_better_than_trivial
 from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.metrics import MSE

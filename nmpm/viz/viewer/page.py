@@ -18,7 +18,7 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm._support.colours import hex_code, material_colours
+from nmpm.colours import hex_code, material_colours
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import vertical_axis
 from nmpm.viz.occupancy import CELL, LEVELS, ensemble_colour

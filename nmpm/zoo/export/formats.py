@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 from torch.export import Dim, ExportedProgram
 
+from nmpm._support import __version__
 from nmpm._support.atomic import atomic_write
 from nmpm._support.messages import install
-from nmpm._support.version import __version__
 from nmpm.errors import ConfigError
 from nmpm.transfer import without_kernels
 from nmpm.zoo.export.parts import VARYING, Part, Value

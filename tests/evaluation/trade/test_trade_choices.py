@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from nmpm._support.digests import weights_digest
+from nmpm.emulator.digests import weights_digest
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.trade import (
     Kind,

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
-from nmpm._support.digests import weights_digest
 from nmpm.data.windows import Recording
+from nmpm.emulator.digests import weights_digest
 from nmpm.evaluation.trade import Kind, Scenes, Store, measure
 from nmpm.evaluation.trade.charts import draw_chart
 from nmpm.evaluation.trade.report import (

@@ -11,7 +11,7 @@ import pytest
 
 WAITING = """
 import ctypes, os, subprocess, sys
-from nmpm._support.collectives import RankWatch
+from nmpm.training.rank_watch import RankWatch
 processes = []
 if sys.argv[1] == "0":
     processes += [subprocess.Popen([sys.executable, "-c", "import time; time.sleep(100)"]) for _ in range(2)]
