@@ -68,6 +68,8 @@ class Command:
     """Heading of the help for the options that the class declares."""
     commands: ClassVar[Mapping[str, type[Command]]] = {}
     """Commands of this one, such as those of `nmpm zoo`; it has no options then."""
+    words: ClassVar[Sequence[str]] = ()
+    """The words that state its values, if `run_words` has made it."""
 
     def __post_init__(self) -> None:
         for name, hint in get_type_hints(type(self), include_extras=True).items():
@@ -79,24 +81,6 @@ class Command:
     def help_values(cls) -> Mapping[str, str]:
         """Texts that stand in the docstring for names in braces."""
         return {}
-
-    @property
-    def words(self) -> list[str]:
-        """The words after the command's name that state its values."""
-        words: list[str] = []
-        declared = [one for _, group in _by_class(type(self)) for one in group]
-        for one in sorted(declared, key=lambda one: not _is_positional(one)):
-            value = getattr(self, one.name)
-            if value is not None and "text" in one.metadata:
-                value = one.metadata["text"].write(value)
-            if value is None or (not _is_positional(one) and value in (one.default, [])):
-                continue
-            values = [] if value is True else [str(part) for part in (value if isinstance(value, list) else [value])]
-            if not _is_positional(one):
-                joined = bool(values) and values[0].startswith("-")
-                values = [f"{label(one)}={values[0]}"] if joined else [label(one), *values]
-            words += values
-        return words
 
     def run(self) -> int | None:
         """Run the command; the exit status, of which None is 0."""
@@ -114,7 +98,9 @@ class Command:
         for one in fields(cls):
             if "text" in one.metadata:
                 values[one.name] = one.metadata["text"].read(label(one), values[one.name])
-        return cls(**values).run()
+        command = cls(**values)
+        object.__setattr__(command, "words", words)
+        return command.run()
 
 
 def label(declared: Field[Any]) -> str:

@@ -20,11 +20,7 @@ def _new_ids(text: str) -> dict[int, int]:
     return {int(old): int(new) for old, new in pairs}
 
 
-_NEW_IDS = Text(
-    _new_ids,
-    "OLD=NEW pairs of type ids, e.g. 5=0,3=1",
-    lambda ids: ",".join(f"{old}={new}" for old, new in ids.items()),
-)
+_NEW_IDS = Text(_new_ids, "OLD=NEW pairs of type ids, e.g. 5=0,3=1")
 
 
 @dataclass(frozen=True, kw_only=True)

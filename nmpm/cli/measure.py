@@ -33,7 +33,7 @@ from nmpm.cli.options import (
     choose_threads,
     describe,
 )
-from nmpm.errors import ConfigError, ZooError
+from nmpm.errors import ConfigError
 
 if TYPE_CHECKING:
     from nmpm.evaluation.stress import ModelUnderTest, TestResult
@@ -201,15 +201,18 @@ class _Sweep(DeviceOptions, StrictReadingOptions, FactOptions):
         from nmpm.evaluation import trade
         from nmpm.evaluation.trade.report import likely_points, report_lines, summary_table, write_report
         from nmpm.viz.output import STYLES
+        from nmpm.zoo.registry import load_models, load_models_of
 
-        if config is None:
-            sweep = trade.read_sweep(trade.shipped_sweep_text(self.command), f"the sweep of nmpm {self.command}")
-        else:
-            sweep = trade.read_sweep(read_text(config), str(config))
+        text = trade.shipped_sweep_text(self.command) if config is None else read_text(config)
+        sweep = trade.read_sweep(text, f"the sweep of nmpm {self.command}" if config is None else str(config))
         sweep = sweep if self.scenes is None else sweep.with_scenes(self.scenes)
         sweep = sweep if members is None else sweep.with_members(members)
         factories = [trade.find_factory(path) for path in predictors]
-        loaded = _models_of(Path(dataset).name) if models is None else _load_models(models)
+        if models is None:
+            loaded, damaged = load_models_of(Path(dataset).name)
+            sys.stderr.writelines(f"left out: {error}\n" for error in damaged)
+        else:
+            loaded = load_models(models)
         if self.wider:
             scenes = trade.find_wider_scenes(dataset, sweep.scenes, self.wider)
         else:
@@ -359,27 +362,3 @@ class Compare(_Sweep):
 
     def run(self) -> None:
         self.measure(str(self.data), self.models, [], None, None, times=True)
-
-
-def _load_models(names: list[str]) -> dict[str, Pretrained]:
-    """Models by name; those of runs and entries by the folder's name where that is unique."""
-    from nmpm.zoo import load_model
-
-    short = {name: Path(name).name if Path(name).is_dir() else name for name in names}
-    unique = len(set(short.values())) == len(short)
-    return {short[name] if unique else name: load_model(name) for name in names}
-
-
-def _models_of(dataset: str) -> dict[str, Pretrained]:
-    """The zoo's models of a simulated dataset by name; damaged ones are left out, and named on stderr."""
-    from nmpm.zoo import Zoo, load_model
-    from nmpm.zoo.card import preset_of
-
-    models = {}
-    for name in Zoo.list():
-        try:
-            if preset_of(Zoo.card(name)) == dataset:
-                models[name] = load_model(name)
-        except ZooError as error:
-            sys.stderr.write(f"left out: {error}\n")
-    return models

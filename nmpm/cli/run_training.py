@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
-import json
-import logging
 import operator
 import re
 import shlex
@@ -12,14 +9,11 @@ import signal
 import sys
 import threading
 import traceback
-import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NoReturn, TypeVar, get_type_hints
 
 from jsonargparse import ArgumentParser, get_loader, set_loader, set_parsing_settings
@@ -33,25 +27,23 @@ from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
 from lightning.pytorch.utilities import rank_zero_only
 from yaml import YAMLError
 
-from nmpm import decoders, metrics, optimizers, processors, transfer
 from nmpm._support.atomic import atomic_write
 from nmpm._support.bounded_files import check_yaml
 from nmpm._support.machine import device_name, find_device
-from nmpm._support.messages import one_line, plain_warnings
+from nmpm._support.messages import one_line
 from nmpm._support.plain_data import load_plugins
 from nmpm._support.shipped import PACKAGE
 from nmpm._support.threads import stated_threads
 from nmpm.cli import COMMANDS, expand_home
-from nmpm.cli.command import UsageError, argument_texts, explain, sections
+from nmpm.cli.command import UsageError, argument_texts, explain
 from nmpm.cli.matched_run import MatchedRun, stored_scene
 from nmpm.cli.options import MatchOptions, check_folder
 from nmpm.cli.run_folder import CHECKPOINTS, CONFIG, SAVERS, RunFolder, next_folder
-from nmpm.cli.training import OPTIONS_FILE, known_options, read_config
+from nmpm.cli.training import known_options, read_config
 from nmpm.cli.trust import OPTION, foreign_names, trust_advice
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.inspection import contradictions_warning
 from nmpm.data.sources import FolderSource
-from nmpm.emulator import EmulatorRecipe
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.scene import Scene
 from nmpm.training.budget import check_endless_batches
@@ -65,60 +57,8 @@ from nmpm.training.checkpoints import AtomicCheckpointIO, read_checkpoint
 from nmpm.training.module import EmulatorModule
 from nmpm.training.optimization import check_learning_rate
 from nmpm.training.preflight import check_disk, check_memory, fitting_precision
+from nmpm.training.quiet import quiet_lightning
 from nmpm.training.rank_watch import RankWatch, is_lost_connection
-
-REMARKS = re.compile(
-    r"(\[rank: \d+\] )?Seed set to"
-    r"|Found current_model_state in the checkpoint"
-    r"|Using .*(Automatic Mixed Precision|precision)"
-    r"|(GPU|TPU|HPU|IPU) available: "
-    r"|LOCAL_RANK: "
-    r"|You are using a CUDA device"
-    r"|.{0,3}Tip: For seamless cloud"
-    r"|Loading `train_dataloader` to estimate"
-    r"|Initializing distributed: "
-    r"|-+\ndistributed_backend="
-    r"|Restor(ing|ed all) states from"
-    r"|Loaded model weights from"
-    r"|`Trainer\.fit` stopped: "
-    r"|Time limit reached\."
-    r"|\s*Detected KeyboardInterrupt"
-    r"|\[rank: \d+\] Received SIGTERM"
-)
-"""Messages that Lightning logs in the course of every run."""
-
-WARNINGS = (
-    r"`isinstance\(treespec, LeafSpec\)` is deprecated",
-    r"Checkpoint directory .* exists and is not empty",
-    r"Experiment logs directory .* exists and is not empty",
-    r"Couldn't infer the batch indices fetched",
-    r"It is recommended to use `self\.log\(.*sync_dist=True\)`",
-    r"`max_epochs` was not set",
-    r"The '\w+' does not have many workers",
-    r"You're using the WeightAveraging callback, but loading a checkpoint outside",
-    r"Be aware that when using `ckpt_path`, callbacks used to create the checkpoint",
-    r"Precision .* is not supported by the model summary",
-    r"You have overridden `on_before_batch_transfer` in `LightningModule`",
-)
-"""Lightning's warnings about what is meant to be so."""
-
-
-def _is_no_remark(record: logging.LogRecord) -> bool:
-    return not (record.name.startswith("lightning") and REMARKS.match(record.getMessage()))
-
-
-@contextmanager
-def quiet_lightning() -> Iterator[None]:
-    """Hide `REMARKS` and `WARNINGS` while it lasts; everything else is shown, warnings without lines of code."""
-    loggers = map(logging.getLogger, ("lightning.pytorch", "lightning.fabric", "lightning", ""))
-    handlers = [handler for logger in loggers for handler in logger.handlers]
-    with ExitStack() as undo, warnings.catch_warnings(), plain_warnings():
-        for message in WARNINGS:
-            warnings.filterwarnings("ignore", message, module=r"lightning\.")
-        for handler in handlers:
-            handler.addFilter(_is_no_remark)
-            undo.callback(handler.removeFilter, _is_no_remark)
-        yield
 
 
 class BriefParser(LightningArgumentParser):
@@ -142,8 +82,6 @@ def is_of_other_packages(error: BaseException) -> bool:
 
 OWN = ("materials", "stride", "strict", "start_from", "members", "threads")
 """Options of the commands that LightningCLI lacks."""
-PARTS = (processors, transfer, decoders, optimizers, metrics)
-"""Modules whose classes are named in configurations."""
 T = TypeVar("T")
 
 
@@ -532,62 +470,3 @@ class RunConfig(SaveConfigCallback):
             config["data"]["path"] = str(Path(config["data"]["path"]).absolute())
         with atomic_write(root / CONFIG) as part:
             part.write_text(self.parser.dump(config, skip_unset=False), encoding="utf-8")
-
-
-TRAINER = {
-    "default_root_dir": "folder of the run's files; further runs go to its version_1, version_2, ...",
-    "max_steps": "end of the training in steps, or by max_time, whichever is first",
-    "max_time": "end of the training as DD:HH:MM:SS",
-    "accelerator": "where to compute: auto, cpu, gpu",
-    "devices": "how many devices, see docs/scaling.md",
-    "precision": "of the network: bf16-mixed, or 32-true, which CPUs without bfloat16 take in its place",
-    "val_check_interval": "steps from validation to validation",
-    "enable_progress_bar": "false for none",
-}
-"""What the help says of arguments of Lightning's Trainer; it lists no others."""
-
-
-def training_options() -> dict[str, Any]:
-    """Arguments of model, data and trainer, those of processors, transfers and decoders, and the names of classes."""
-    classes = {"model": (EmulatorModule, EmulatorRecipe), "data": (TrajectoryDataModule,), "trainer": (Trainer,)}
-    known: dict[str, Any] = {"lightning": metadata.version("lightning")}
-    for group, kinds in classes.items():
-        texts = {name: text for kind in kinds for name, text in sections(kind)[1].items()}
-        sentences = {name: re.split(r"[.] (?=[A-Z])|[.]$", text)[0] for name, text in texts.items()}
-        shown = TRAINER if group == "trainer" else sentences | {"scene": "", "horizon": ""}  # linked
-        known[group] = {
-            name: _described(parameter) | {"text": shown.get(name, "")}
-            for kind in kinds
-            for name, parameter in inspect.signature(kind).parameters.items()
-            if name != "recipe"
-        }
-    known["classes"] = {module.__name__: _classes(module) for module in PARTS}
-    known["parts"] = {
-        name: f"model.{part}.{name}"
-        for part, module in (("processor", processors), ("transfer", transfer), ("decoder", decoders))
-        for kind in _classes(module)
-        for name, parameter in inspect.signature(getattr(module, kind)).parameters.items()
-        if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
-    }
-    return known
-
-
-def _described(parameter: inspect.Parameter) -> dict[str, str | None]:
-    """Type and default of an argument, as source code."""
-    default, annotation = parameter.default, parameter.annotation
-    text = repr(default) if isinstance(default, bool | int | float | str | tuple) else None
-    if text is None and default not in (None, parameter.empty):
-        text = getattr(default, "__name__", f"{type(default).__name__}()")
-    kind = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
-    return {"type": kind, "default": text}
-
-
-def _classes(module: ModuleType) -> list[str]:
-    """Names of the classes of nmpm in a module."""
-    kinds = [kind for kind in vars(module).values() if isinstance(kind, type)]
-    own = [kind for kind in kinds if kind.__module__.startswith("nmpm.") and not issubclass(kind, Exception)]
-    return sorted({kind.__name__ for kind in own})
-
-
-if __name__ == "__main__":
-    OPTIONS_FILE.write_text(json.dumps(training_options(), indent=1) + "\n", encoding="utf-8")

@@ -41,9 +41,9 @@ FEWEST_STEPS = 2_000
 
 @cache
 def known_options() -> Mapping[str, Any]:
-    """What `nmpm.cli.run_training.training_options` found in the classes: types, defaults and texts of their arguments.
+    """Types, defaults and texts of the arguments of model, data and trainer.
 
-    It is stored, as the classes take seconds to import; `python -m nmpm.cli.run_training` writes the file anew.
+    They are stored, as the classes take seconds to import; `python benchmarks/training_options.py` writes them anew.
     """
     known: dict[str, Any] = json.loads(OPTIONS_FILE.read_text(encoding="utf-8"))
     if metadata.version("lightning") != known.pop("lightning"):

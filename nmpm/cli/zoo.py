@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -17,12 +17,7 @@ from nmpm.cli.options import DeviceOptions, Existing, FactOptions, ReadingOption
 from nmpm.errors import ConfigError, NmpmError, ZooError
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
-    from nmpm.zoo.ranking import Standing, Trial
-
-_WORDS = ("gravity", "speeds", "particles to a cell", "boundary", "obstacles")
-"""Of warnings, in short."""
+    from nmpm.zoo.ranking import Standing
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -116,7 +111,7 @@ class Match(_ZooCommand, ReadingOptions, FactOptions):
         from nmpm._support.progress import progress_bar
         from nmpm.data.dataset import Dataset
         from nmpm.data.sources import FolderSource
-        from nmpm.zoo.ranking import Ranking, Trial
+        from nmpm.zoo.ranking import Ranking, Trial, ranking_table
         from nmpm.zoo.registry import Zoo, load_model
 
         trial = Trial.of(Dataset(FolderSource(self.data, self.facts)))
@@ -124,7 +119,7 @@ class Match(_ZooCommand, ReadingOptions, FactOptions):
         loaders = {name: (lambda name=name: load_model(name, root=self.root).emulator) for name in names}
         with progress_bar("models", len(names)) as step:
             standings = Ranking(trial, self.match.materials, self.match.stride).rank(loaders, step)
-        Console().print(_table(trial, standings))
+        Console().print(ranking_table(trial, standings))
         best = next((one for one in standings if one.match is not None and math.isfinite(one.error)), None)
         sys.stdout.write("".join(f"{line}\n" for line in self._advice(best)))
 
@@ -135,7 +130,7 @@ class Match(_ZooCommand, ReadingOptions, FactOptions):
         lines = [f"warning: {warning}" for warning in best.match.warnings]
         if best.error >= 1:
             lines.append("No model is better than a trivial predictor; a fine-tuning may be.")
-        materials, facts, data = _pairs(best, ","), self.arguments, str(self.data)
+        materials, facts, data = best.pairs(","), self.arguments, str(self.data)
         stated = [*(["--materials", materials] * bool(materials)), *(["--stride", self.stride] if self.stride else [])]
         if facts:
             data = derived_name(self.data, "").name + "-stated"
@@ -145,46 +140,6 @@ class Match(_ZooCommand, ReadingOptions, FactOptions):
             "to start from it:": ["fit", "--start_from", best.model, "--data.path", data],
         }
         return [*lines, *(f"{how:<17} {shlex.join(['nmpm', *call, *stated])}" for how, call in calls.items())]
-
-
-def _table(trial: Trial, standings: Sequence[Standing]) -> Table:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    title = (
-        f"{trial.name}, {trial.scene.dim}-D models: errors at {trial.frames} frames over that of the better trivial"
-        " predictor"
-    )
-    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0, collapse_padding=True)
-    table.add_column("model", no_wrap=True)
-    for heading in ("error", "cells", "stride", "gravity"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for heading in ("materials", "not matched"):
-        table.add_column(heading)
-    for one in standings:
-        error = f"{one.error:.2g}" if math.isfinite(one.error) else ""
-        if one.match is None:
-            table.add_row(one.model, error, "", "", "", "", one.failure)
-            continue
-        reading = one.match.reading
-        unmatched = [word for word in _WORDS if any(word in warning.lower() for warning in one.match.warnings)]
-        table.add_row(
-            one.model,
-            error,
-            "×".join(map(str, one.match.recipe.grid.shape)),
-            str(reading.every) if reading.between == 1 else f"1/{reading.between}",
-            "" if one.match.gravity is None else f"× {one.match.gravity:.3g}",
-            _pairs(one, ", "),
-            ", ".join([*unmatched, *([one.failure] if one.failure else [])]),
-        )
-    table.add_row("nothing moves", f"{trial.still / trial.trivial:.2g}")
-    table.add_row("free fall", f"{trial.free_fall / trial.trivial:.2g}")
-    return table
-
-
-def _pairs(one: Standing, separator: str) -> str:
-    """The model's material by the data's name, where the names do not tell."""
-    return separator.join(f"{name}={theirs}" for name, theirs in (one.stated or {}).items())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -274,13 +229,13 @@ class Refresh(_ZooCommand, DeviceOptions):
     failures: str | None = option(metavar="TEXT")
 
     def run(self) -> None:
-        from nmpm.zoo.registry import Zoo
+        from nmpm.zoo.registry import Zoo, find_writable
 
         _check_one("--data is the folder of one model's data", self.data, self.name)
         _check_one("--failures is about one model", self.failures, self.name)
         root = user_zoo() if self.root is None else self.root
         names = Zoo.list(root) if self.name is None else [self.name]
-        folders = [_find_writable(name, self.root) for name in names]
+        folders = [find_writable(name, self.root) for name in names]
         from nmpm.zoo.refresh import refresh, write_index  # imports torch
 
         for folder in folders:
@@ -294,26 +249,6 @@ def _check_one(option: str, value: object, name: str | None) -> None:
     """Make sure that an option about one model comes with its name."""
     if value is not None and name is None:
         raise ConfigError(f"{option}: give the model's NAME too.")
-
-
-def _find_writable(model: str, root: Path | None) -> Path:
-    """The folder of an entry to refresh: of that name in the user's own zoo or in `root`, or at that path.
-
-    Raises:
-        ConfigError: if it is on the hub.
-        ZooError: if there is none.
-    """
-    from nmpm.zoo.hub import HubId
-    from nmpm.zoo.registry import Zoo, find_entry
-
-    if root is None and not (user_zoo().is_dir() and model in Zoo.list(user_zoo())):
-        if Path(model).is_dir():
-            return find_entry(Path(model))
-        if HubId.parse(model) is not None:
-            raise ConfigError(
-                f"{model} is on the hub: `nmpm zoo pull {model} NAME` makes an entry of it; refresh that."
-            )
-    return Zoo.folder(model, user_zoo() if root is None else root)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,6 +9,8 @@ from fractions import Fraction
 from functools import partial
 
 import torch
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
 from torch import Tensor
 
 from nmpm._support.messages import one_line
@@ -30,6 +32,8 @@ from nmpm.scene import Motion, Reading, Scene
 FRAMES = 32
 """Frames of the data that are predicted, or as many as there are."""
 _WINDOWS = 3
+_WORDS = ("gravity", "speeds", "particles to a cell", "boundary", "obstacles")
+"""Of warnings, in short."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,10 @@ class Standing:
     failure: str = ""
     stated: Mapping[str, str] | None = None
 
+    def pairs(self, separator: str) -> str:
+        """The model's material by the data's name, where the names do not tell, such as "big=sand"."""
+        return separator.join(f"{name}={theirs}" for name, theirs in (self.stated or {}).items())
+
 
 @dataclass(frozen=True)
 class Ranking:
@@ -179,3 +187,36 @@ class Ranking:
         mean = _mean_squared_error(predicted, with_predicted(trial.window, predictor.bundle))
         relative, failure = (mean / trial.trivial, "") if math.isfinite(mean) else (math.inf, "not finite")
         return Standing(name, relative, match, failure, materials)
+
+
+def ranking_table(trial: Trial, standings: Sequence[Standing]) -> Table:
+    """The standings as a table, with what could not be matched, and the trivial predictors below."""
+    title = (
+        f"{trial.name}, {trial.scene.dim}-D models: errors at {trial.frames} frames over that of the better trivial"
+        " predictor"
+    )
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0, collapse_padding=True)
+    table.add_column("model", no_wrap=True)
+    for heading in ("error", "cells", "stride", "gravity"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for heading in ("materials", "not matched"):
+        table.add_column(heading)
+    for one in standings:
+        error = f"{one.error:.2g}" if math.isfinite(one.error) else ""
+        if one.match is None:
+            table.add_row(one.model, error, "", "", "", "", one.failure)
+            continue
+        reading = one.match.reading
+        unmatched = [word for word in _WORDS if any(word in warning.lower() for warning in one.match.warnings)]
+        table.add_row(
+            one.model,
+            error,
+            "×".join(map(str, one.match.recipe.grid.shape)),
+            str(reading.every) if reading.between == 1 else f"1/{reading.between}",
+            "" if one.match.gravity is None else f"× {one.match.gravity:.3g}",
+            one.pairs(", "),
+            ", ".join([*unmatched, *([one.failure] if one.failure else [])]),
+        )
+    table.add_row("nothing moves", f"{trial.still / trial.trivial:.2g}")
+    table.add_row("free fall", f"{trial.free_fall / trial.trivial:.2g}")
+    return table

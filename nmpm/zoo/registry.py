@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import builtins
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from numbers import Real
@@ -26,7 +26,7 @@ from nmpm._support.machine import device_name, find_device
 from nmpm._support.messages import one_line, suggestion
 from nmpm._support.shipped import entry_names, shipped_folder, user_zoo
 from nmpm.errors import ConfigError, ZooError
-from nmpm.zoo.card import BEST, CARD, LAST, read_card, stated_error, stated_milliseconds
+from nmpm.zoo.card import BEST, CARD, LAST, preset_of, read_card, stated_error, stated_milliseconds
 from nmpm.zoo.hub import HubId, download
 
 if TYPE_CHECKING:
@@ -248,6 +248,42 @@ def find_entry(model: str | Path, root: Root = None) -> Path:
             f"{one_line(folder)} has no {CARD}: `nmpm zoo add RUN NAME` makes an entry of a run, with a card."
         )
     return folder
+
+
+def find_writable(model: str, root: Path | None = None) -> Path:
+    """The folder of an entry to refresh: of that name in the user's own zoo or in `root`, or at that path.
+
+    Raises:
+        ConfigError: if it is on the hub.
+        ZooError: if there is none.
+    """
+    if root is None and not (user_zoo().is_dir() and model in Zoo.list(user_zoo())):
+        if Path(model).is_dir():
+            return find_entry(Path(model))
+        if HubId.parse(model) is not None:
+            raise ConfigError(
+                f"{model} is on the hub: `nmpm zoo pull {model} NAME` makes an entry of it; refresh that."
+            )
+    return Zoo.folder(model, user_zoo() if root is None else root)
+
+
+def load_models(names: Sequence[str]) -> dict[str, Pretrained]:
+    """Models by name; those of runs and entries by the folder's name where that is unique."""
+    short = {name: Path(name).name if Path(name).is_dir() else name for name in names}
+    unique = len(set(short.values())) == len(short)
+    return {short[name] if unique else name: load_model(name) for name in names}
+
+
+def load_models_of(dataset: str) -> tuple[dict[str, Pretrained], list[ZooError]]:
+    """The zoo's models of a simulated dataset by name, and why damaged ones are left out."""
+    models, left_out = dict[str, "Pretrained"](), list[ZooError]()
+    for name in Zoo.list():
+        try:
+            if preset_of(Zoo.card(name)) == dataset:
+                models[name] = load_model(name)
+        except ZooError as error:
+            left_out.append(error)
+    return models, left_out
 
 
 def check_name(name: str) -> None:

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from nmpm.cli import doctor, main
-from nmpm.zoo import self_test
+from nmpm.cli import main
+from nmpm.zoo import installation, self_test
 from nmpm.zoo.verification import Check
 
 
@@ -31,7 +31,7 @@ def test_the_report_is_complete_without_paths_of_the_home_and_passes(monkeypatch
 
 
 def test_a_failed_test_is_the_last_line_and_the_status(monkeypatch, capsys):
-    monkeypatch.setattr(doctor, "sections", dict)
+    monkeypatch.setattr(installation, "sections", lambda device: {"self-test": lambda: installation.outcomes(device)})
     monkeypatch.setattr(self_test, "self_test", lambda device: iter([Check("loss", 1.0, 2.0, 0.9, 1.1)]))
     monkeypatch.setattr(self_test, "speed", lambda device: "fast")
     assert main(["doctor"]) == 1
@@ -44,9 +44,7 @@ def test_what_is_broken_does_not_end_the_report(monkeypatch, capsys):
         yield "first", "known"
         raise ImportError("libcudart.so is missing")
 
-    monkeypatch.setattr(doctor, "sections", lambda: {"gpu": broken, "versions": doctor.versions})
-    monkeypatch.setattr(self_test, "self_test", lambda device: iter([]))
-    monkeypatch.setattr(self_test, "speed", lambda device: "fast")
+    monkeypatch.setattr(installation, "sections", lambda _: {"gpu": broken, "versions": installation.versions})
     assert main(["doctor"]) == 1
     report = capsys.readouterr().out
     assert "  first          known\n  ERROR          ImportError: libcudart.so is missing\n\nversions\n" in report
@@ -62,4 +60,4 @@ def test_what_is_broken_does_not_end_the_report(monkeypatch, capsys):
 )
 def test_instructions_are_read_from_linux(monkeypatch, cpuinfo, names):
     monkeypatch.setattr(Path, "read_text", lambda path: cpuinfo)
-    assert doctor.instructions() == names
+    assert installation.instructions() == names

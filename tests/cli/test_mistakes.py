@@ -295,10 +295,11 @@ def test_simulators_and_numba_are_imported_for_simulated_data_alone():
 
 def test_the_stored_options_of_trainings_are_those_of_the_classes():
     # A process of its own: options accept every subclass that is imported, and tests define some.
-    script = "import json; from nmpm.cli.run_training import training_options; print(json.dumps(training_options()))"
+    file = str(Path(__file__).parents[2] / "benchmarks" / "training_options.py")
+    script = f"import json, runpy; print(json.dumps(runpy.run_path({file!r})['training_options']()))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     stored = json.loads(OPTIONS_FILE.read_text(encoding="utf-8"))
-    assert stored == json.loads(done.stdout), "python -m nmpm.cli.run_training writes them anew"
+    assert stored == json.loads(done.stdout), "python benchmarks/training_options.py writes them anew"
 
 
 def test_without_a_home_folder_files_are_kept_with_the_temporary_ones(monkeypatch):

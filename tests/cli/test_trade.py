@@ -3,10 +3,10 @@ import re
 import shlex
 
 from nmpm.cli import main
-from nmpm.cli.measure import _models_of
 from nmpm.data.sources import FolderSource
 from nmpm.evaluation.trade import read_scenes, shipped_sweep_text
 from nmpm.zoo import Pretrained, load_model
+from nmpm.zoo.registry import load_models_of
 from tests.evaluation.trade.made_up import SWEEP, tiny_emulator, tiny_scenes
 
 
@@ -23,13 +23,16 @@ def test_models_are_those_of_the_dataset_and_damaged_ones_are_left_out(tmp_path,
     (tmp_path / "zoo" / "other" / "card.yaml").write_text("format: 1\ndataset: recorded")
     (tmp_path / "zoo" / "broken" / "card.yaml").write_text("{")
     loaded = []
-    monkeypatch.setattr("nmpm.zoo.load_model", lambda name: loaded.append(name) or load_model(name))
-    assert sorted(_models_of("goop")) == ["goop", "goop/fast"]
+    monkeypatch.setattr("nmpm.zoo.registry.load_model", lambda name: loaded.append(name) or load_model(name))
+    models, left_out = load_models_of("goop")
+    assert sorted(models) == ["goop", "goop/fast"]
     assert sorted(loaded) == ["bad", "goop", "goop/fast"]
-    left_out = capsys.readouterr().err.splitlines()
-    assert [line.partition(": ")[0] for line in left_out] == ["left out", "left out"]
-    assert "bad/model.safetensors" in left_out[0]
-    assert "broken/card.yaml" in left_out[1]
+    monkeypatch.setattr("nmpm.evaluation.trade.find_scenes", lambda *_: tiny_scenes(tmp_path / "tiny"))
+    assert main(["trade", "goop", "--materials", "mud=clay", "--out", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err.splitlines()
+    assert said[:2] == [f"left out: {error}" for error in left_out]
+    for line, file in zip(said, ("bad/model.safetensors", "broken/card.yaml", "no model has clay"), strict=True):
+        assert file in line
 
 
 def test_a_folder_is_measured_with_a_predictor_of_another_package_and_the_report_written(tmp_path, capsys):
@@ -49,7 +52,7 @@ def test_a_folder_is_measured_with_a_predictor_of_another_package_and_the_report
 def test_models_are_compared(tmp_path, capsys, monkeypatch):
     scenes = tiny_scenes(tmp_path / "tiny")
     model = Pretrained(tiny_emulator(scenes.scene), {})
-    monkeypatch.setattr("nmpm.zoo.load_model", lambda _: model)
+    monkeypatch.setattr("nmpm.zoo.registry.load_model", lambda _: model)
     words = ["compare", "goop", "--data", str(tmp_path / "tiny"), "--out", str(tmp_path / "out")]
     monkeypatch.setattr("nmpm.evaluation.trade.shipped_sweep_text", lambda _: SWEEP)
     assert main(words) == 0
@@ -63,7 +66,7 @@ def test_models_are_compared(tmp_path, capsys, monkeypatch):
 def test_ensembles_stand_beside_one_rollout_in_time_and_crps(tmp_path, capsys, monkeypatch):
     scenes = tiny_scenes(tmp_path / "tiny")
     model = Pretrained(tiny_emulator(scenes.scene), {"ensemble": {"nudge": 0.3}})
-    monkeypatch.setattr("nmpm.zoo.load_model", lambda _: model)
+    monkeypatch.setattr("nmpm.zoo.registry.load_model", lambda _: model)
     (tmp_path / "sweep.yaml").write_text(SWEEP)
     words = ["trade", str(tmp_path / "tiny"), "--models", "goop", "--config", str(tmp_path / "sweep.yaml")]
     assert main([*words, "--members", "3", "--out", str(tmp_path / "out")]) == 0
@@ -89,7 +92,7 @@ def record(folder, name):
 def test_of_recordings_errors_come_first_then_how_long_the_rest_takes(tmp_path, capsys, monkeypatch):
     data, out = record(tmp_path, "my data"), tmp_path / "out"
     model = Pretrained(tiny_emulator(read_scenes("recorded", FolderSource(data), 2).scene), {})
-    monkeypatch.setattr("nmpm.zoo.load_model", lambda _: model)
+    monkeypatch.setattr("nmpm.zoo.registry.load_model", lambda _: model)
     monkeypatch.setattr("nmpm.evaluation.trade.shipped_sweep_text", lambda _: SWEEP)
     words = ["trade", str(data), "--models", "goop", "--out", str(out)]
     assert main(words) == 0
