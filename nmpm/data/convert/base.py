@@ -189,14 +189,17 @@ class RunFiles(Reader):
 
     def _count(self, run: Run, metadata: Metadata) -> int:
         with suppress(DataError):  # raised again where the run is needed
-            return len(next(self.read(run.file, [run.index], metadata)).position)
+            return sum(len(trajectory.position) for trajectory in self.read(run.file, [run.index], metadata))
         return 0
 
     def _read_all(self, runs: Sequence[Run], metadata: Metadata) -> Iterator[Trajectory]:
         for file, group in groupby(runs, lambda run: run.file):
             inside = list(group)
             trajectories = self.read(file, [run.index for run in inside], metadata)
-            for run, trajectory in zip(inside, trajectories, strict=True):
+            for run in inside:
+                trajectory = next(trajectories, None)
+                if trajectory is None:
+                    raise DataError(f"{file}: its run {run.index} is missing, or empty.")
                 yield run.take(trajectory)
 
 

@@ -143,8 +143,9 @@ def test_short_tracks_share_slots(tmp_path):
         ([*lines(made()), "3,2,0.5"], r"a\.csv, line 42: it has 3 cells, the header has 4"),
         ([*lines(made()), "3,2,a,0.5"], r"the column x must contain numbers, but has 'a'"),
         (lines(made(), "frame,name,x,y"), r"no column id \(columns: frame, name, x, y\)"),
+        (["frame,particle,x,y"], r"a\.csv: its run 0 is missing, or empty"),
     ],
-    ids=["twice", "cells", "text", "id"],
+    ids=["twice", "cells", "text", "id", "empty"],
 )
 def test_bad_rows_are_refused_by_number(tmp_path, rows, message):
     path = write(tmp_path / "a.csv", rows)
