@@ -32,7 +32,7 @@ from nmpm._support.progress import progress_bar
 from nmpm.data.format import Metadata, Split, Trajectory, find_split, read_metadata
 from nmpm.data.recordings import EvaluationLoader, RecordingReader, SplitRecordings
 from nmpm.data.simulation import SimulationRequest
-from nmpm.emulator import Prescribed, stream_members, stream_rollout
+from nmpm.emulator import Prescribed, RolloutOptions, stream_rollout
 from nmpm.emulator.prescribed import with_predicted
 from nmpm.errors import UnstableError
 from nmpm.evaluation.bootstrap import resampled_means
@@ -119,12 +119,9 @@ def parse_model(text: str, members: int, scenes: int) -> tuple[Ensemble, Scene]:
 
     def predict(window: Window, index: int) -> Parts:
         state, frames, given = window.initial, window.target.shape[1], Prescribed.of(window)
-        if single:
-            parts = stream_rollout(emulator, state, frames, prescribed=given)
-        else:
-            parts = stream_members(
-                emulator, state, frames, members, index, model.nudge if size is None else size, given
-            )
+        nudge = model.nudge if size is None else size
+        options = RolloutOptions(given, members=None if single else members, seed=index, nudge=nudge)
+        parts = stream_rollout(emulator, state, frames, options)
         return (part.position for part in parts)
 
     return Ensemble(text, 1 if single else members, predict, scenes, emulator.frames), model.scene

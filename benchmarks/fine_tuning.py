@@ -36,7 +36,7 @@ from torch.nn.utils import parametrize
 
 import nmpm
 from nmpm import EmulatorModule, TrajectoryDataModule, Zoo
-from nmpm.emulator import Emulator, Prescribed, predict_rollout
+from nmpm.emulator import Emulator, Prescribed, RolloutOptions, predict_rollout
 from nmpm.emulator.calibration import calibrate
 from nmpm.evaluation.comparison import Comparison
 from nmpm.metrics import MSE, overall_error
@@ -261,7 +261,9 @@ def rollout_errors(emulator: Emulator, windows: Iterable[Window]) -> dict[str, f
     """Errors of full rollouts by name: the model's, of which "overall" chooses weights, and trivial predictors'."""
     errors = Comparison(emulator.scene, [MSE()], emulator.frames)
     for window in windows:
-        predicted = predict_rollout(emulator, window.initial, window.target.shape[1], prescribed=Prescribed.of(window))
+        predicted = predict_rollout(
+            emulator, window.initial, window.target.shape[1], RolloutOptions(Prescribed.of(window))
+        )
         errors.update(window, predicted.position, predicted.fields)
     values = errors.compute()
     return {name: float(value) for name, value in (values | {"overall": overall_error(values, HORIZON)}).items()}

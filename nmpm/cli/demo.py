@@ -85,7 +85,6 @@ class Demo(DeviceOptions):
         from nmpm._support.machine import device_name
         from nmpm._support.messages import counted
         from nmpm.cli.options import choose_threads
-        from nmpm.cli.prediction import Start
         from nmpm.data.format import Split, write_split
         from nmpm.emulator.monitor import Monitor, Policy
         from nmpm.evaluation.machine import clock_for
@@ -96,6 +95,7 @@ class Demo(DeviceOptions):
         from nmpm.viz.viewer import ViewerPage
         from nmpm.zoo import load_model
         from nmpm.zoo.scenes import scene_window, training_preset
+        from nmpm.zoo.starts import Start
 
         (file, page), model = self._files, load_model(self.model, self.device)
         preset = training_preset(model)
@@ -130,8 +130,8 @@ class Demo(DeviceOptions):
 def _simulate(preset: Preset, seed: int, frames: int) -> tuple[Trajectory, float]:
     """The scene of a seed, and the simulator's milliseconds of CPU time per frame."""
     from nmpm._support.progress import progress_bar
-    from nmpm.cli.prediction import milliseconds
     from nmpm.zoo.scenes import simulate_scene
+    from nmpm.zoo.starts import milliseconds
 
     sys.stdout.flush()
     times = [time.thread_time()]

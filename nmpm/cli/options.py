@@ -111,17 +111,6 @@ def check_data(option: str, data: Path) -> None:
         raise ConfigError(f"{option} {data}: {name_obstacle(data) or known + suggestion(str(data), names)}")
 
 
-def find_data(data: Path, split: str | None, index: int) -> Path:
-    """The file or folder of data; of an embedded dataset the folder, simulated first if it lacks the trajectory."""
-    from nmpm.data.catalog import ensure, find_simulated
-
-    if data.exists():
-        return data
-    counts = {"train": 0, "valid": 0, "test": 0} | {split or "test": index + 1}
-    simulated = find_simulated(str(data), index + 1) if split in (None, "test") else None
-    return simulated or ensure(str(data), counts)
-
-
 def derived_name(path: Path, suffix: str) -> Path:
     """A file's path with another suffix; of a folder, its name in the working directory."""
     return (Path(path.resolve().name) if path.is_dir() else path).with_suffix(suffix)

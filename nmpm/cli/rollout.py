@@ -19,7 +19,6 @@ from nmpm.cli.options import (
     ModelOptions,
     Natural,
     Positive,
-    PresetName,
     RuntimeOptions,
     SplitName,
     StrictReadingOptions,
@@ -54,7 +53,6 @@ class RollOut(ModelOptions, DeviceOptions, ThreadsOptions, RuntimeOptions, Stric
             one .h5 or .vtkhdf, or in out-0.csv, out-1.csv, ….
         nudge: Standard deviation of the displacements of members' starts (default: the model's, see nmpm zoo card).
         until: End with the last frame that is trusted, see the how-to.
-        fallback: Simulate the frames after the last trusted one, see nmpm simulate --list.
         particles: Throw blocks of about so many in all (with --blocks: 1000).
         blocks: Throw so many blocks (with --particles: one of each material).
         precision: Of the network: float32 (default), or bfloat16, less accurate, faster if the processor supports it.
@@ -75,7 +73,6 @@ class RollOut(ModelOptions, DeviceOptions, ThreadsOptions, RuntimeOptions, Stric
         nmpm rollout goop --out splash.usda                    for Blender; .vtkhdf for ParaView, .csv, …
         nmpm rollout goop --device cuda                        on a GPU, by CUDA graphs
         nmpm rollout waterramps --until trusted                as far as it predicts this scene
-        nmpm rollout waterramps --fallback waterramps          and on from there by the simulator
         nmpm rollout waterramps --members 8                    eight futures of one start
     """
 
@@ -88,7 +85,6 @@ class RollOut(ModelOptions, DeviceOptions, ThreadsOptions, RuntimeOptions, Stric
     members: Positive | None = option(metavar="M")
     nudge: Annotated[float, _check_nudge] | None = option(metavar="CELLS")
     until: Literal["trusted"] | None = None
-    fallback: PresetName | None = option(metavar="PRESET")
     particles: Positive | None = None
     blocks: Positive | None = None
     precision: Literal["float32", "bfloat16"] = "float32"
@@ -107,8 +103,8 @@ class RollOut(ModelOptions, DeviceOptions, ThreadsOptions, RuntimeOptions, Stric
         facts = [fact for fact in self.arguments if not fact.startswith("--gravity")]
         if self.data is None and facts:
             raise ConfigError(f"{facts[0]} is about recorded data: give --data too.")
-        if self.members is not None and (self.until or self.fallback):
-            raise ConfigError("--until and --fallback are about one rollout: leave --members out.")
+        if self.members is not None and self.until:
+            raise ConfigError("--until is about one rollout: leave --members out.")
         if self.nudge is not None and self.members is None:
             raise ConfigError(f"--nudge {self.nudge} displaces the starts of members: give --members too.")
         from nmpm.data.write import find_writer
@@ -117,11 +113,11 @@ class RollOut(ModelOptions, DeviceOptions, ThreadsOptions, RuntimeOptions, Stric
             find_writer("--out", path)
 
     def run(self) -> None:
-        from nmpm.cli.prediction import recorded_start, roll_out, scene_start
+        from nmpm.cli.prediction import roll_out, start_of
         from nmpm.zoo.registry import load_model
 
         model = load_model(self.model, self.device, self.root)
-        start = scene_start(model, self) if self.data is None else recorded_start(model, self, self.data)
+        start = start_of(model, self)
         model = start.model.optimized(self.runtime, self.precision)
         choose_threads(model, self.threads)
         sys.stdout.write(f"to look at them: {roll_out(dataclasses.replace(start, model=model), self)}\n")

@@ -66,6 +66,15 @@ def find_simulated(name: str, test: int) -> Path | None:
     return next((folder for folder, counts in folders if counts.get("test", 0) >= test), None)
 
 
+def find_data(data: Path, split: str | None = None, index: int = 0) -> Path:
+    """The file or folder of data; of an embedded dataset the folder, simulated first if it lacks the trajectory."""
+    if data.exists():
+        return data
+    counts = {"train": 0, "valid": 0, "test": 0} | {split or "test": index + 1}
+    simulated = find_simulated(str(data), index + 1) if split in (None, "test") else None
+    return simulated or ensure(str(data), counts)
+
+
 def _complete_folders(name: str, request: SimulationRequest) -> Iterator[tuple[Path, Mapping[str, int]]]:
     """Complete folders that differ from the request in their counts at most, with these counts."""
     wanted = request.to_dict()

@@ -1,16 +1,15 @@
 """The emulator: its recipe, the network between p2g and g2p, what its rollouts are held to, and rollouts themselves."""
 
 from nmpm.emulator.bundle import Bundle, RolloutContext
-from nmpm.emulator.members import predict_members, stream_members
 from nmpm.emulator.model import NETWORK_PRECISIONS, Emulator
 from nmpm.emulator.prescribed import Prescribed
 from nmpm.emulator.recipe import EmulatorRecipe
 from nmpm.emulator.rollouts import (
     Rollout,
+    RolloutOptions,
     differentiable_rollout,
     predict_rollout,
     rollout,
-    stream,
     stream_rollout,
     unroll,
 )
@@ -24,13 +23,11 @@ __all__ = [
     "Prescribed",
     "Rollout",
     "RolloutContext",
+    "RolloutOptions",
     "Windows",
     "differentiable_rollout",
-    "predict_members",
     "predict_rollout",
     "rollout",
-    "stream",
-    "stream_members",
     "stream_rollout",
     "unroll",
 ]

@@ -7,8 +7,6 @@ the scene, not on the number of members: only rounding, which differs between ba
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,10 +17,6 @@ from nmpm._support.plain_data import check_whole, is_finite
 from nmpm.emulator.constraints import distance_beyond
 from nmpm.emulator.engines.torch.contact import Contact, obstacle_share
 from nmpm.emulator.model import Emulator
-from nmpm.emulator.monitor import Monitor
-from nmpm.emulator.noise import Noise
-from nmpm.emulator.prescribed import Prescribed
-from nmpm.emulator.rollouts import Rollout, stream_rollout
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 
@@ -40,84 +34,6 @@ def check_members(members: Any, seed: Any, nudge: Any) -> None:
     check_whole("seed", seed, 0)
     if nudge is not None and not (is_finite(nudge) and nudge >= 0):
         raise ConfigError(f"nudge = {nudge!r}: it must be a number of cells, 0 or more, such as {NUDGE}.")
-
-
-def predict_members(
-    emulator: Emulator,
-    state: Particles,
-    frames: int,
-    members: int,
-    seed: int = 0,
-    nudge: float | None = None,
-    prescribed: Prescribed | None = None,
-    monitor: Monitor | None = None,
-) -> Rollout:
-    """All frames of `stream_members` at once: positions (M, B, frames, N, D) and fields (M, B, frames, N)."""
-    parts = list(stream_members(emulator, state, frames, members, seed, nudge, prescribed, monitor))
-    if parts:
-        return Rollout.join(parts).by_member(members)
-    scenes, *rest = state.position.shape
-    none = state.position.new_zeros(members, scenes, frames, *rest)  # of no scene, or of no frame
-    return Rollout(none, dict.fromkeys(emulator.scene.evolving, none[..., 0]))
-
-
-def stream_members(
-    emulator: Emulator,
-    state: Particles,
-    frames: int,
-    members: int,
-    seed: int = 0,
-    nudge: float | None = None,
-    prescribed: Prescribed | None = None,
-    monitor: Monitor | None = None,
-) -> Iterator[Rollout]:
-    """Predict members of the rollouts from a state as `stream_rollout`, yielding up to m frames as they are made.
-
-    Members are computed in batches of as many scenes as `MOST_SCENES` and `MOST_CELLS` allow, all batches bundle by
-    bundle: memory holds the activations of one. Members that do not differ, without noise and nudge, are computed once.
-
-    Args:
-        emulator: In evaluation mode.
-        state: Of B scenes.
-        frames: How many.
-        members: M, how many rollouts of each scene.
-        seed: Of noise and nudges.
-        nudge: As for `member_starts`.
-        prescribed: As for `stream_rollout`, the same for all members.
-        monitor: Watches all members; its scenes are the M·B rows.
-
-    Yields:
-        Positions (M·B, <= m, N, D) and fields (M·B, <= m, N): rows 0 … B - 1 are those of member 0.
-
-    Raises:
-        ConfigError: if `members`, `seed` or `nudge` is too small.
-        DataError, RolloutStoppedError: as `stream_rollout`.
-    """
-    starts = member_starts(emulator, state, members, seed, nudge)
-    if not (emulator.processor.noise or nudge_of(emulator, nudge)):
-        for part in stream_rollout(emulator, state, frames, monitor, prescribed):
-            yield Rollout.stack([part] * members)
-        return
-    scenes = len(state.position)
-    batches = _batches(emulator, members * scenes)
-    monitors = [monitor and dataclasses.replace(monitor, first_scene=rows.start) for rows in batches]
-    streams = [
-        stream_rollout(
-            emulator,
-            starts.scenes(slice(rows.start, rows.stop)),
-            frames,
-            watch,
-            prescribed and _rows_of(prescribed, [row % scenes for row in rows]),
-            Noise(emulator, [int(_sequence(seed, row, scenes).generate_state(1, np.uint64)[0]) for row in rows]),
-        )
-        for rows, watch in zip(batches, monitors, strict=True)
-    ]
-    try:
-        for parts in zip(*streams, strict=True):
-            yield Rollout.stack(parts)
-    finally:
-        if monitor is not None:
-            monitor.gather([watch for watch in monitors if watch is not None])
 
 
 @torch.no_grad()
@@ -179,7 +95,7 @@ def _is_free(emulator: Emulator, state: Particles) -> Tensor:
     return within & ~Contact(share, emulator.grid).inside(emulator.in_cells(state)[0])
 
 
-def _batches(emulator: Emulator, rows: int) -> list[range]:
+def batches_of(emulator: Emulator, rows: int) -> list[range]:
     """The rows of each batch, about as many in all."""
     most = max(1, MOST_CELLS // emulator.grid.size)
     if emulator.device.type == "cpu":
@@ -188,15 +104,11 @@ def _batches(emulator: Emulator, rows: int) -> list[range]:
     return [range(rows * part // count, rows * (part + 1) // count) for part in range(count)]
 
 
+def noise_seed(seed: int, row: int, scenes: int) -> int:
+    """The seed of the noise of a row of M·B."""
+    return int(_sequence(seed, row, scenes).generate_state(1, np.uint64)[0])
+
+
 def _sequence(seed: int, row: int, scenes: int) -> np.random.SeedSequence:
     """The random state of a row of M·B: of its member of its scene."""
     return np.random.SeedSequence((seed, *divmod(row, scenes)))
-
-
-def _rows_of(prescribed: Prescribed, scenes: Sequence[int]) -> Prescribed:
-    """What is prescribed in some of the scenes, the same one repeatedly."""
-
-    def pick(values: Tensor) -> Tensor:
-        return values.expand(len(scenes), *values.shape[1:]) if len(values) == 1 else values[list(scenes)]
-
-    return prescribed.map(pick)

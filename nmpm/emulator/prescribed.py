@@ -72,6 +72,13 @@ class Prescribed(Batched):
         frames = frames if frames.dim() == 4 else frames.unsqueeze(0)
         return cls(obstacle=torch.cat([frames[:, :1], frames], dim=1))
 
+    def scenes(self, chosen: slice | list[int]) -> Self:
+        """As of any batch; by a list also several times the same scene, and what is the same for all scenes."""
+        if isinstance(chosen, slice):
+            return super().scenes(chosen)
+        rows = len(chosen)
+        return self.map(lambda values: values.expand(rows, *values.shape[1:]) if len(values) == 1 else values[chosen])
+
     def apply(self, state: Particles, frame: int, ahead: int) -> Particles:
         """The state after so many frames, a whole number of bundles of `ahead` frames, as the next starts from it."""
         return self._move_obstacles(self._exchange(state, frame, ahead), frame, ahead)

@@ -1,9 +1,13 @@
-"""Rollouts: call the emulator bundle after bundle, from one state, for as many frames as asked."""
+"""Rollouts: call the emulator bundle after bundle, from one state, for as many frames as asked.
+
+`stream_rollout` is the one way to roll out without gradients: of one future or of members, watched or not. The other
+functions are views of it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -12,25 +16,66 @@ from torch.utils.checkpoint import checkpoint
 
 from nmpm._support.plain_data import check_whole
 from nmpm.emulator.bundle import Bundle, RolloutContext
+from nmpm.emulator.members import batches_of, check_members, member_starts, noise_seed, nudge_of
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor, check_inputs, warn_of_training_mode
 from nmpm.emulator.noise import Noise
 from nmpm.emulator.periods import Periods
 from nmpm.emulator.prescribed import Exchange, Prescribed
+from nmpm.emulator.trust import COMPANIONS, TrustTracker
+from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.transfer import is_eager_cpu
 
 Call = Callable[[Emulator, Particles, RolloutContext], Bundle]
 
 
+@dataclass(frozen=True)
+class RolloutOptions:
+    """What a rollout is given beside its state and its number of frames.
+
+    Args:
+        prescribed: Particles that enter and leave, and obstacles that move; the same for all members.
+        noise: What a stochastic processor reads, which without any predicts one future. Members draw their own.
+        monitor: Watches each bundle; of members all of them, its scenes the M·B rows.
+        members: M, how many rollouts of each scene, see `nmpm.emulator.members`; None for one from the state as it is.
+        seed: Of the members' noise and nudges.
+        nudge: Standard deviation in cells of the displacements of members' starts, see `member_starts`.
+        tracker: Watches how far the rollouts part. A single one, of which nothing changes, is compared with
+            `COMPANIONS` that start nearby, whatever the nudge: three rollouts cost about three times as much. Of
+            several members each is compared with each.
+        until_trusted: End with the last frame of any scene that the tracker trusts. Positions and fields of a scene
+            that is lost earlier than others of its batch are NaN from then on.
+
+    Raises:
+        ConfigError: if `members`, `seed` or `nudge` is too small, or there is no tracker to trust.
+    """
+
+    prescribed: Prescribed | None = None
+    noise: Noise | None = None
+    monitor: Monitor | None = None
+    members: int | None = None
+    seed: int = 0
+    nudge: float | None = None
+    tracker: TrustTracker | None = None
+    until_trusted: bool = False
+
+    def __post_init__(self) -> None:
+        check_members(1 if self.members is None else self.members, self.seed, self.nudge)
+        if self.until_trusted and self.tracker is None:
+            raise ConfigError("until_trusted: a tracker says which frames are: give tracker=TrustTracker(…), too.")
+
+
+PLAIN = RolloutOptions()
+"""One rollout of what moves freely, as the processor predicts it without noise."""
+
+
 def unroll(
     emulator: Emulator,
     particles: Particles,
     bundles: int,
-    monitor: Monitor | None = None,
+    options: RolloutOptions = PLAIN,
     frames: int | None = None,
-    prescribed: Prescribed | None = None,
-    noise: Noise | None = None,
 ) -> Iterator[Bundle]:
     """Predict bundle after bundle, each from the last, keeping gradients where they are enabled.
 
@@ -38,8 +83,10 @@ def unroll(
     particles enter or leave, positions and fields of those that are not there are NaN.
 
     On a CPU, scenes whose state no longer changes are repeated without a call. The monitor measures each bundle before
-    it is yielded, and names no frame beyond the number that is used, `frames`; all if that is left out.
+    it is yielded, and names no frame beyond the number that is used, `frames`; all if that is left out. Of one rollout:
+    members and trust are left to `stream_rollout`.
     """
+    prescribed, monitor = options.prescribed, options.monitor
     exchange = Exchange(emulator, prescribed)
     particles = exchange.start(particles)
     if monitor is not None:
@@ -48,7 +95,7 @@ def unroll(
             monitor.ignore_energy()
     periods = Periods(emulator)
     particles = periods.wrap(particles)
-    calls = _Calls(emulator, particles, exchange, noise)
+    calls = _Calls(emulator, particles, exchange, options.noise)
     for index in range(bundles):
         bundle = calls.predict(particles)
         travelled = periods.unwrapped(bundle)
@@ -158,27 +205,20 @@ class Rollout(NamedTuple):
         return Rollout(self.position.cpu(), {name: values.cpu() for name, values in self.fields.items()})
 
 
-def stream(emulator: Emulator, particles: Particles, frames: int, monitor: Monitor | None = None) -> Iterator[Tensor]:
-    """Yield the positions (B, <= m, N, D) of `stream_rollout`."""
-    for part in stream_rollout(emulator, particles, frames, monitor):
-        yield part.position
-
-
 def stream_rollout(
-    emulator: Emulator,
-    particles: Particles,
-    frames: int,
-    monitor: Monitor | None = None,
-    prescribed: Prescribed | None = None,
-    noise: Noise | None = None,
+    emulator: Emulator, particles: Particles, frames: int, options: RolloutOptions = PLAIN
 ) -> Iterator[Rollout]:
     """Predict `frames` frames of positions and evolving fields without gradients, yielding up to m as they are made.
 
-    With particles that enter and leave, and obstacles that move, as `prescribed`; with `noise` for a stochastic
-    processor, which without any predicts one future. Positions of particles that are not
-    there, which have left through an open axis or as prescribed, or are yet to enter, are NaN.
+    Members are computed in batches of as many scenes as `MOST_SCENES` and `MOST_CELLS` allow, all batches bundle by
+    bundle: memory holds the activations of one. Members that do not differ, without noise and nudge, are computed once.
 
     Warns if the emulator is in training mode, in which constraints do not act.
+
+    Yields:
+        Positions (B, <= m, N, D) and fields (B, <= m, N); of members (M·B, …), rows 0 … B - 1 those of member 0.
+        Positions of particles that are not there, which have left through an open axis or as prescribed, or are yet
+        to enter, are NaN.
 
     Raises:
         ConfigError: if `frames` is negative, or no whole number.
@@ -186,10 +226,19 @@ def stream_rollout(
             are other particles than the state's.
         RolloutStoppedError: if the monitor stops the rollout.
     """
+    if options.tracker is not None:
+        watched = _stream_watched(emulator, particles, frames, options, options.tracker)
+        return _trusted_frames(watched, options.tracker) if options.until_trusted else watched
+    if options.members is not None:
+        return _stream_members(emulator, particles, frames, options, options.members)
+    return _stream_one(emulator, particles, frames, options)
+
+
+def _stream_one(emulator: Emulator, particles: Particles, frames: int, options: RolloutOptions) -> Iterator[Rollout]:
     frames = check_whole("frames", frames, 0)
     warn_of_training_mode(emulator)
     check_inputs(emulator, particles)
-    bundles = unroll(emulator, particles, -(-frames // emulator.frames), monitor, frames, prescribed, noise)
+    bundles = unroll(emulator, particles, -(-frames // emulator.frames), options, frames)
     made = 0
     while made < frames:
         with torch.no_grad():  # entered anew for each bundle: a suspended generator must not leak the mode
@@ -201,32 +250,80 @@ def stream_rollout(
         yield part
 
 
-def rollout(
-    emulator: Emulator,
-    particles: Particles,
-    frames: int,
-    monitor: Monitor | None = None,
-    prescribed: Prescribed | None = None,
-) -> Tensor:
-    """(B, frames, N, D) positions in domain length, predicted without gradients, as `stream_rollout`."""
-    return predict_rollout(emulator, particles, frames, monitor, prescribed).position
+def _stream_members(
+    emulator: Emulator, state: Particles, frames: int, options: RolloutOptions, members: int
+) -> Iterator[Rollout]:
+    seed, nudge, prescribed, monitor = options.seed, options.nudge, options.prescribed, options.monitor
+    starts = member_starts(emulator, state, members, seed, nudge)
+    if not (emulator.processor.noise or nudge_of(emulator, nudge)):
+        for part in _stream_one(emulator, state, frames, options):
+            yield Rollout.stack([part] * members)
+        return
+    scenes = len(state.position)
+    batches = batches_of(emulator, members * scenes)
+    monitors = [monitor and replace(monitor, first_scene=rows.start) for rows in batches]
+    streams = []
+    for rows, watch in zip(batches, monitors, strict=True):
+        given = prescribed and prescribed.scenes([row % scenes for row in rows])
+        noise = Noise(emulator, [noise_seed(seed, row, scenes) for row in rows])
+        start = starts.scenes(slice(rows.start, rows.stop))
+        streams.append(_stream_one(emulator, start, frames, RolloutOptions(given, noise, watch)))
+    try:
+        for parts in zip(*streams, strict=True):
+            yield Rollout.stack(parts)
+    finally:
+        if monitor is not None:
+            monitor.gather([watch for watch in monitors if watch is not None])
 
 
-def predict_rollout(
-    emulator: Emulator,
-    particles: Particles,
-    frames: int,
-    monitor: Monitor | None = None,
-    prescribed: Prescribed | None = None,
-    noise: Noise | None = None,
-) -> Rollout:
-    """Predict `frames` frames of positions and evolving fields without gradients, as `stream_rollout`."""
+def _stream_watched(
+    emulator: Emulator, state: Particles, frames: int, options: RolloutOptions, tracker: TrustTracker
+) -> Iterator[Rollout]:
+    """All frames, while the tracker watches how far the rollouts part."""
+    streams = [stream_rollout(emulator, state, frames, replace(options, tracker=None, until_trusted=False))]
+    if options.members is None or options.members == 1:
+        beside = RolloutOptions(options.prescribed, members=COMPANIONS, seed=options.seed + 1)
+        streams.append(stream_rollout(emulator, state, frames, beside))
+    for parts in zip(*streams, strict=True):
+        tracker.see(torch.cat([part.position for part in parts]).unflatten(0, (-1, len(state.position))))
+        if options.monitor is not None:
+            options.monitor.trust = tracker.report()
+        yield parts[0]
+
+
+def _trusted_frames(parts: Iterator[Rollout], tracker: TrustTracker) -> Iterator[Rollout]:
+    """The frames that a tracker, which has seen them, trusts, up to the last one of any scene."""
+    made = 0
+    for part in parts:
+        kept = int(tracker.frames.max()) - made
+        index = torch.arange(made + 1, tracker.made + 1)
+        there = (index <= tracker.frames[:, None]).repeat(len(part.position) // len(tracker.frames), 1)
+        there = there.to(part.position.device)[..., None]
+        position = part.position.where(there[..., None], torch.nan)[:, :kept]
+        fields = {name: values.where(there, torch.nan)[:, :kept] for name, values in part.fields.items()}
+        yield Rollout(position, fields)
+        made = tracker.made
+        if kept < len(index):
+            return
+
+
+def rollout(emulator: Emulator, particles: Particles, frames: int, options: RolloutOptions = PLAIN) -> Tensor:
+    """(B, frames, N, D) positions in domain length of `predict_rollout`."""
+    return predict_rollout(emulator, particles, frames, options).position
+
+
+def predict_rollout(emulator: Emulator, particles: Particles, frames: int, options: RolloutOptions = PLAIN) -> Rollout:
+    """All frames of `stream_rollout` at once; of M members (M, B, frames, N, D) and fields (M, B, frames, N)."""
     batch, *rest = particles.position.shape
-    parts = list(stream_rollout(emulator, particles, frames, monitor, prescribed, noise)) if batch else []
+    parts = list(stream_rollout(emulator, particles, frames, options)) if batch else []
     if parts:
-        return Rollout.join(parts)
-    none = particles.position.new_zeros(batch, frames, *rest)  # of no scene, or of no frame
-    return Rollout(none, dict.fromkeys(emulator.scene.evolving, none[..., 0]))
+        made = Rollout.join(parts)
+    else:  # of no scene, or of no frame
+        none = particles.position.new_zeros(batch * (options.members or 1), frames, *rest)
+        made = Rollout(none, dict.fromkeys(emulator.scene.evolving, none[..., 0]))
+    if options.until_trusted and options.tracker is not None:
+        made = made._replace(trusted=options.tracker.frames)
+    return made if options.members is None else made.by_member(options.members)
 
 
 def unroll_with_gradients(

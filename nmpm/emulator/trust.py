@@ -11,7 +11,7 @@ a tenth with the recorded scene are, on average, the same.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -19,15 +19,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from nmpm._support.plain_data import check_whole, is_finite
-from nmpm.emulator.members import mean_pair_distance, stream_members
-from nmpm.emulator.model import Emulator
-from nmpm.emulator.monitor import Monitor
-from nmpm.emulator.prescribed import Prescribed
-from nmpm.emulator.rollouts import Rollout, stream_rollout
+from nmpm._support.plain_data import is_finite
+from nmpm.emulator.members import mean_pair_distance
 from nmpm.errors import DataError
 from nmpm.grid import counting_grid
-from nmpm.particles import Particles, Window
+from nmpm.particles import Particles
 from nmpm.scene import Scene
 from nmpm.transfer import Linear
 
@@ -185,91 +181,3 @@ def _sum_blocks(values: Tensor, dim: int) -> Tensor:
         padding = [0, 0] * (-axis - 1) + [0, -values.shape[axis] % _REGION]
         values = functional.pad(values, padding).unflatten(axis, (-1, _REGION)).sum(axis)
     return values
-
-
-def stream_watched(
-    emulator: Emulator,
-    state: Particles,
-    frames: int,
-    tracker: TrustTracker,
-    members: int | None = None,
-    seed: int = 0,
-    nudge: float | None = None,
-    prescribed: Prescribed | None = None,
-    monitor: Monitor | None = None,
-) -> Iterator[Rollout]:
-    """Predict as `stream_rollout`, or as `stream_members`, while a tracker watches how far the rollouts part.
-
-    A single rollout, of which nothing changes, is compared with `COMPANIONS` that start nearby, whatever the nudge of
-    members: three rollouts cost about three times as much. Of several members each is compared with each.
-    """
-    if members is None:
-        streams = [stream_rollout(emulator, state, frames, monitor, prescribed)]
-    else:
-        streams = [stream_members(emulator, state, frames, members, seed, nudge, prescribed, monitor)]
-    if members is None or members == 1:
-        streams.append(stream_members(emulator, state, frames, COMPANIONS, seed + 1, prescribed=prescribed))
-    for parts in zip(*streams, strict=True):
-        tracker.see(torch.cat([part.position for part in parts]).unflatten(0, (-1, len(state.position))))
-        if monitor is not None:
-            monitor.trust = tracker.report()
-        yield parts[0]
-
-
-def until_trusted(parts: Iterator[Rollout], tracker: TrustTracker) -> Iterator[Rollout]:
-    """The frames of `stream_watched` that are trusted, up to the last one of any scene.
-
-    Positions and fields of a scene that is lost earlier than others of its batch are NaN from then on.
-    """
-    made = 0
-    for part in parts:
-        kept = int(tracker.frames.max()) - made
-        index = torch.arange(made + 1, tracker.made + 1)
-        there = (index <= tracker.frames[:, None]).repeat(len(part.position) // len(tracker.frames), 1)
-        there = there.to(part.position.device)[..., None]
-        position = part.position.where(there[..., None], torch.nan)[:, :kept]
-        fields = {name: values.where(there, torch.nan)[:, :kept] for name, values in part.fields.items()}
-        yield Rollout(position, fields)
-        made = tracker.made
-        if kept < len(index):
-            return
-
-
-def calibrate(emulator: Emulator, windows: Iterable[Window]) -> Trust:
-    """The trust of an emulator on recorded scenes, each the only one of a window.
-
-    Raises:
-        DataError: if there is none.
-    """
-    members, truth = [], []
-    for window in windows:
-        state, frames = window.initial, window.target.shape[1]
-        beside, apart = (TrustTracker(emulator.scene, state, Trust()) for _ in range(2))
-        prescribed = Prescribed.of(window)
-        for part in stream_watched(emulator, state, frames, beside, prescribed=prescribed):
-            recorded = window.target[:, apart.made : beside.made]
-            apart.see(torch.stack([part.position, recorded.to(part.position)]))
-        members.append(beside.curve[0])
-        truth.append(apart.curve[0])
-    return Trust.fit(members, truth)
-
-
-def predict_trusted(
-    emulator: Emulator,
-    trust: Trust,
-    state: Particles,
-    frames: int,
-    prescribed: Prescribed | None = None,
-    members: int | None = None,
-    seed: int = 0,
-    nudge: float | None = None,
-) -> Rollout:
-    """Predict as `predict_rollout`, or `predict_members`, up to the last trusted frame of any scene.
-
-    Positions of scenes that are lost before others are NaN from then on; `trusted` (B,) says when.
-    """
-    check_whole("frames", frames, 1)
-    tracker = TrustTracker(emulator.scene, state, trust)
-    watched = stream_watched(emulator, state, frames, tracker, members, seed, nudge, prescribed)
-    made = Rollout.join(list(until_trusted(watched, tracker)))._replace(trusted=tracker.frames)
-    return made if members is None else made.by_member(members)

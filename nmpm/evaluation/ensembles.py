@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nmpm._support.collectives import all_gather
-from nmpm.emulator import Emulator, Prescribed, stream_members
+from nmpm.emulator import Emulator, Prescribed, RolloutOptions, stream_rollout
 from nmpm.emulator.members import nudge_of
 from nmpm.emulator.prescribed import with_predicted
 from nmpm.evaluation.bootstrap import interval
@@ -46,7 +46,8 @@ class EnsembleTest:
         """
         start, frames, seed = window.to(self.emulator.device), window.target.shape[1], len(self.scores.rows)
         prescribed, scored = Prescribed.of(start), with_predicted(window, self.emulator.frames).to("cpu")
-        parts = stream_members(self.emulator, start.initial, frames, self.members, seed, self.nudge, prescribed)
+        options = RolloutOptions(prescribed, members=self.members, seed=seed, nudge=self.nudge)
+        parts = stream_rollout(self.emulator, start.initial, frames, options)
         self.scores.update(scored, (part.position for part in parts))
         self.single.update(scored, [predicted])
 

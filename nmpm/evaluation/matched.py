@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from nmpm.data.windows import interpolate, model_velocity
-from nmpm.emulator import Emulator, Prescribed, rollout
+from nmpm.emulator import Emulator, Prescribed, RolloutOptions, rollout
 from nmpm.emulator.prescribed import predict_from_entries
 from nmpm.particles import Particles, Window
 from nmpm.scene import Reading, Scene
@@ -69,7 +69,7 @@ class MatchedPredictor:
     def __call__(self, particles: Particles, frames: int, prescribed: Prescribed | None = None) -> Tensor:
         """Positions (B, frames, N, D) of the dataset's next frames from a state of the dataset, in domain length."""
         state = self.state(particles)
-        path = rollout(self.emulator, state, self.steps(frames), prescribed=prescribed)
+        path = rollout(self.emulator, state, self.steps(frames), RolloutOptions(prescribed))
         if self.reading.every == 1:
             return path[:, self.reading.between - 1 :: self.reading.between]
         return interpolate(torch.cat([state.position.unsqueeze(1), path], 1), self.reading.every)[:, 1 : frames + 1]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import multiprocessing
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from fractions import Fraction
 from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING
 
@@ -16,15 +18,20 @@ from numpy.typing import NDArray
 
 from nmpm.errors import ConfigError, UnstableError
 from nmpm.obstacles import Disc
+from nmpm.particles import Particles
 from nmpm.play.simulating import Simulated, simulate_for
 from nmpm.scene import Scene
 from nmpm.sim import InitialState, Preset
-from nmpm.zoo.fallback import fitting_preset, initial_state
+from nmpm.sim.mpm.mixture import MpmMixture
+from nmpm.sim.state import Array
+from nmpm.zoo.scenes import SAME, scene_differences
 
 if TYPE_CHECKING:
     from nmpm.play.world import World
 
 _TIMED_FRAMES = 40
+_LONGEST_RATIO = 64
+"""Largest denominator of the ratio between the frames of model and preset."""
 
 
 class SimulatorBeside:
@@ -140,3 +147,48 @@ class SimulatorBeside:
         ordered = np.full((self._count, position.shape[1]), np.nan, np.float32)
         ordered[self._there[self._order]] = position
         return ordered
+
+
+def fitting_preset(scene: Scene, state: Particles, preset: Preset) -> Preset:
+    """The preset with the frames of a model's scene, from whose state it shall go on.
+
+    Raises:
+        ConfigError: naming what differs: a material, the bounds, the volume of particles, what the simulator lacks; or
+            obstacles that cannot be told from their particles.
+    """
+    differences = dict.fromkeys(scene_differences(scene, preset), True) | {
+        "its particles are all of one size": state.volume is not None and bool((state.volume[state.mask] != 1).any()),
+        f"it has no {', '.join(scene.fields)}": bool(scene.fields),
+        "its obstacles do not move": scene.moving_obstacles,
+        "it simulates only states that it has drawn": isinstance(preset, MpmMixture),
+    }
+    for difference, differs in differences.items():
+        if differs:
+            raise ConfigError(f"the preset {preset.name} is of other scenes than the model's: {difference}.")
+    for index in range(len(state.position)):
+        preset.obstacles_from(_obstacle(state, index))
+    ratio = scene.dt / preset.frame_dt
+    if math.isclose(ratio, 1.0, rel_tol=SAME):
+        return preset
+    return preset.with_stride(Fraction(ratio).limit_denominator(_LONGEST_RATIO))
+
+
+def _obstacle(state: Particles, index: int) -> Array:
+    """(M, D) obstacle particles of a scene of the batch."""
+    return state.obstacle[index, state.obstacle_mask[index]].cpu().double().numpy()
+
+
+def initial_state(scene: Scene, state: Particles, preset: Preset) -> tuple[InitialState, NDArray[np.int64]]:
+    """What the simulator starts from, and the state's particles in the simulator's order, by material."""
+    real, names = state.mask[0].cpu().numpy(), preset.scene.materials
+    kinds = np.array([names.index(name) for name in scene.materials])[state.material[0].cpu().numpy()[real]]
+    order = np.argsort(kinds, kind="stable")
+    position, velocity = (
+        values[0].detach().cpu().double().numpy()[real][order] for values in (state.position, state.velocity)
+    )
+    low, high = np.array(preset.reach).T
+    gravity = tuple((state.gravity[0].double() / scene.dt**2).tolist()) if scene.gravity_known else None
+    counts = tuple(np.bincount(kinds, minlength=len(names)).tolist())
+    obstacles = preset.obstacles_from(_obstacle(state, 0))
+    # (beyond the simulator's walls by rounding alone)
+    return InitialState(np.clip(position, low, high), velocity / scene.dt, gravity, counts, obstacles), order

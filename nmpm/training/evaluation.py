@@ -8,7 +8,7 @@ import torch
 from lightning.pytorch import LightningModule
 from torch import Tensor
 
-from nmpm.emulator import Emulator, Prescribed, Rollout, predict_rollout
+from nmpm.emulator import Emulator, Prescribed, Rollout, RolloutOptions, predict_rollout
 from nmpm.errors import ConfigError
 from nmpm.evaluation.comparison import Comparison
 from nmpm.evaluation.ensembles import EnsembleTest
@@ -103,11 +103,11 @@ class EvaluatedModule(LightningModule):
         start, frames, rows = batch.initial, batch.target.shape[1], self.rows(batch)
         prescribed = Prescribed.of(batch)
         if len(rows) == 1:
-            return predict_rollout(self.emulator, start, frames, prescribed=prescribed)
+            return predict_rollout(self.emulator, start, frames, RolloutOptions(prescribed))
 
         def predict(part: slice) -> Rollout:
             given = prescribed and prescribed.scenes(part)
-            return predict_rollout(self.emulator, start.scenes(part), frames, prescribed=given)
+            return predict_rollout(self.emulator, start.scenes(part), frames, RolloutOptions(given))
 
         return Rollout.stack(on_threads(predict, rows, self.threads or len(rows)))
 

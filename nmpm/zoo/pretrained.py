@@ -19,12 +19,20 @@ from torch import Tensor
 
 from nmpm._support.machine import find_device
 from nmpm.data.format import Trajectory
-from nmpm.emulator import NETWORK_PRECISIONS, Emulator, Prescribed, Rollout, differentiable_rollout, predict_rollout
-from nmpm.emulator.members import nudge_of, predict_members
+from nmpm.emulator import (
+    NETWORK_PRECISIONS,
+    Emulator,
+    Prescribed,
+    Rollout,
+    RolloutOptions,
+    differentiable_rollout,
+    predict_rollout,
+)
+from nmpm.emulator.members import nudge_of
 from nmpm.emulator.monitor import warn_of_start_outside
 from nmpm.emulator.runtimes import Runtime
 from nmpm.emulator.similarity import Match
-from nmpm.emulator.trust import Trust, predict_trusted
+from nmpm.emulator.trust import Trust, TrustTracker
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
@@ -35,7 +43,6 @@ from nmpm.zoo.states import THROWN, TOO_FAST, Bodies, StateBuilder, state_of, th
 if TYPE_CHECKING:
     from nmpm.data.datamodule import TrajectoryDataModule
     from nmpm.data.dataset import Dataset
-    from nmpm.sim import Preset
 
 
 TRUSTED = "trusted"
@@ -63,7 +70,7 @@ class Predictor:
     def rollout(
         self, state: Particles, frames: int, prescribed: Prescribed | None = None,
         members: int | None = None, seed: int = 0, nudge: float | None = None,
-        until: str | None = None, fallback: Preset | str | Path | None = None,
+        until: str | None = None,
     ) -> Tensor:  # fmt: skip
         """Predict positions (B, frames, N, D) in domain length from a state, whose own frame is not among them.
 
@@ -80,46 +87,33 @@ class Predictor:
             until: "trusted" to end with the last frame that is trusted, see `nmpm.emulator.trust`. Of several scenes
                 the last of all; those that are lost before are NaN from then on. A single rollout is compared with two
                 that start nearby, which costs three times the time.
-            fallback: A simulator preset, its name or file, that makes all further frames of each scene from its last
-                trusted one, without strain and pressure at first. Its scenes must be the model's.
 
         Raises:
-            ConfigError: if a number is too small, a nudge is given without members, `until` is another word, or the
-                fallback simulates other scenes, or is given with members or what is prescribed.
-            UnstableError: if the simulator becomes unstable.
+            ConfigError: if a number is too small, a nudge is given without members, or `until` is another word.
 
         Warns:
             UserWarning: if particles start outside of the bounds, into which the first frame moves them.
         """
-        return self.predict(state, frames, prescribed, members, seed, nudge, until, fallback).position
+        return self.predict(state, frames, prescribed, members, seed, nudge, until).position
 
     def predict(
         self, state: Particles, frames: int, prescribed: Prescribed | None = None,
         members: int | None = None, seed: int = 0, nudge: float | None = None,
-        until: str | None = None, fallback: Preset | str | Path | None = None,
+        until: str | None = None,
     ) -> Rollout:  # fmt: skip
         """As `rollout`, with the particles' evolving fields beside their positions, and the last trusted frames."""
         if until not in (None, TRUSTED):
             raise ConfigError(f"until = {until!r}: a rollout ends after its frames (None) or until={TRUSTED!r}.")
         if nudge is not None and members is None:
             raise ConfigError(f"nudge = {nudge!r} displaces the starts of members: give members=8, too.")
-        if fallback is not None and (members is not None or prescribed is not None):
-            raise ConfigError(
-                "fallback: a simulator goes on from one rollout of what moves freely: leave members and what is"
-                " prescribed out."
-            )
         there, given = state.to(self.emulator.device), prescribed and prescribed.to(self.emulator.device)
         warn_of_start_outside(self.emulator, there)
         size = self.nudge if nudge is None else nudge
-        if fallback is not None:
-            from nmpm.zoo.fallback import predict_and_simulate  # imported late, as it imports simulators
-
-            return predict_and_simulate(self.emulator, self.trust, there, frames, fallback)
-        if until is not None:
-            return predict_trusted(self.emulator, self.trust, there, frames, given, members, seed, size)
-        if members is not None:
-            return predict_members(self.emulator, there, frames, members, seed, size, given)
-        return predict_rollout(self.emulator, there, frames, prescribed=given)
+        tracker = None if until is None else TrustTracker(self.emulator.scene, there, self.trust)
+        options = RolloutOptions(
+            given, members=members, seed=seed, nudge=size, tracker=tracker, until_trusted=until is not None
+        )
+        return predict_rollout(self.emulator, there, frames, options)
 
     def differentiable_rollout(self, state: Particles, frames: int) -> Tensor:
         """As `rollout`, with gradients to the state, see `nmpm.emulator.differentiable_rollout`.

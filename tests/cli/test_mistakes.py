@@ -190,7 +190,6 @@ EARLY = [
     (["rollout", "goop", "--device", "abacus"], "--device abacus: it is not one of auto, cpu, cuda, mps."),
     (["rollout", "goop", "--device", "cuda:first"], "--device cuda:first: it is not one of"),
     (["rollout", "goop", "--data", "nowhere"], "--data nowhere: there is no such file or folder"),
-    (["rollout", "goop", "--fallback", "lava"], "There is no preset or file lava"),
     (
         ["rollout", "goop", "--runtime", "fast"],
         "No runtime is called 'fast'; there are auto, openvino",

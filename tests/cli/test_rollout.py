@@ -170,28 +170,23 @@ def test_wrong_members_are_refused_in_one_line(options, message, capsys):
     assert message in capsys.readouterr().err
 
 
-def test_a_rollout_ends_with_the_last_trusted_frame_or_goes_on_with_the_simulator(folder, monkeypatch, capsys):
+def test_a_rollout_ends_with_the_last_trusted_frame(folder, monkeypatch, capsys):
     few = ["rollout", "goop", "--frames", "24", "--particles", "100"]
     assert main([*few, "--out", "full.h5"]) == 0 == main([*few, "--until", "trusted", "--out", "all.h5"])
     assert "Trusted for all 24 frames" in capsys.readouterr().out
     monkeypatch.setattr(Predictor, "trust", Trust(limit=0.02, error=0.25, scenes=8))
     assert main([*few, "--until", "trusted", "--out", "some.h5"]) == 0
-    assert main([*few, "--fallback", "goop", "--out", "on.h5"]) == 0
     said = capsys.readouterr().out
-    full, whole, some, on = (Split(folder / f"{name}.h5").read(0).position for name in ("full", "all", "some", "on"))
+    full, whole, some = (Split(folder / f"{name}.h5").read(0).position for name in ("full", "all", "some"))
     last = len(some) - 2
     assert f"Beyond frame {last} ± {round(0.25 * last)} this scene is one of many." in said
-    assert f"frames {last + 1} to 24 are simulated by goop (MLS-MPM)" in said
     assert 0 < last < 24
-    assert len(on) == 26
     np.testing.assert_array_equal(whole, full)
     np.testing.assert_array_equal(some, full[: len(some)])
-    np.testing.assert_array_equal(on[: len(some)], some)
     monkeypatch.setattr(Predictor, "trust", Trust(limit=1e-9))
     for words, message in (
         ([*few, "--until", "trusted"], "--until trusted: no frame is."),
-        ([*few, "--fallback", "waterramps"], "simulates water, not goop"),
-        ([*few, "--fallback", "goop", "--members", "2"], "leave --members out"),
+        ([*few, "--until", "trusted", "--members", "2"], "leave --members out"),
     ):
         assert main(words) == 1
         assert message in capsys.readouterr().err

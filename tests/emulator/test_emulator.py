@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
-from nmpm.emulator.rollouts import rollout, stream
+from nmpm.emulator import stream_rollout
+from nmpm.emulator.rollouts import rollout
 from nmpm.errors import ConfigError
 from nmpm.processors import UNet
 from nmpm.transfer import Affine, Linear, Nearest, Quadratic, without_kernels
@@ -103,7 +104,7 @@ def test_rollouts_are_cut_to_the_frames_asked_for():
     whole = rollout(emulator, particles, 9)
     for frames in (0, 1, 3, 7):
         assert torch.equal(rollout(emulator, particles, frames), whole[:, :frames])
-    assert [len(part[0]) for part in stream(emulator, particles, 7)] == [3, 3, 1]
+    assert [part.position.shape[1] for part in stream_rollout(emulator, particles, 7)] == [3, 3, 1]
     with pytest.raises(ValueError, match="frames = -1"):
         rollout(emulator, particles, -1)
 

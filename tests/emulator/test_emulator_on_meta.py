@@ -10,7 +10,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
-from nmpm.emulator import Emulator
+from nmpm.emulator import Emulator, RolloutOptions
 from nmpm.emulator.engines.torch.contact import Contact
 from nmpm.emulator.monitor import Monitor
 from nmpm.emulator.rollouts import unroll
@@ -90,7 +90,7 @@ class CountOperations(TorchDispatchMode):
 
 @torch.no_grad()
 def roll(emulator: Emulator, batch: Window, monitor: Monitor | None = None) -> None:
-    bundles = list(unroll(emulator.eval(), batch.initial, 2, monitor))
+    bundles = list(unroll(emulator.eval(), batch.initial, 2, RolloutOptions(monitor=monitor)))
     assert [bundle.position.shape for bundle in bundles] == [(2, emulator.frames, 9, emulator.scene.dim)] * 2
     assert {bundle.position.device.type for bundle in bundles} == {"meta"}
     context = emulator.context(batch.initial)
@@ -133,7 +133,7 @@ def test_bounds_that_raise_errors_and_a_monitor_read_back_once_each(monkeypatch)
         pass
     assert len(checked) == 2  # once per bundle
     with torch.no_grad():
-        list(unroll(emulator.eval(), batch.initial, 2, Monitor()))
+        list(unroll(emulator.eval(), batch.initial, 2, RolloutOptions(monitor=Monitor())))
     assert (len(checked), read) == (4, [4])
 
 

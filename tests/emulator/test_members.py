@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 import torch
 
-from nmpm.emulator import Prescribed, predict_rollout
+from nmpm.emulator import Prescribed, RolloutOptions, predict_rollout, stream_rollout
 from nmpm.emulator.adaptation import with_noise
-from nmpm.emulator.members import MOST_SCENES, member_starts, predict_members, stream_members
+from nmpm.emulator.members import MOST_SCENES, member_starts
 from nmpm.emulator.monitor import Monitor, Policy
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
@@ -28,31 +28,31 @@ def emulator(request):
 
 def test_a_member_depends_on_seed_number_and_scene_alone(emulator):
     two = Particles.stack([cloud(box(), count=40), cloud(box(), count=25, seed=1)])
-    few = predict_members(emulator, two, 10, members=2, seed=3).position
-    many = predict_members(emulator, two, 10, members=2 * MOST_SCENES, seed=3).position
+    few = predict_rollout(emulator, two, 10, RolloutOptions(members=2, seed=3)).position
+    many = predict_rollout(emulator, two, 10, RolloutOptions(members=2 * MOST_SCENES, seed=3)).position
     assert few.shape == (2, 2, 10, 40, 2)
     torch.testing.assert_close(many[:2], few, rtol=1e-5, atol=1e-6)
-    alone = predict_members(emulator, cloud(box(), count=40), 10, members=2, seed=3).position
+    alone = predict_rollout(emulator, cloud(box(), count=40), 10, RolloutOptions(members=2, seed=3)).position
     torch.testing.assert_close(alone[:, 0], few[:, 0], rtol=1e-5, atol=1e-6)
-    other = predict_members(emulator, two, 10, members=2, seed=4).position
+    other = predict_rollout(emulator, two, 10, RolloutOptions(members=2, seed=4)).position
     assert min(float((a - b).abs().max()) for a, b in [(few[0], few[1]), (few, other)]) > 1e-3
 
 
 def test_parts_are_the_frames_of_all_members(emulator):
     state = cloud(box(), batch=3, count=20)
-    parts = list(stream_members(emulator, state, 6, members=4))
+    parts = list(stream_rollout(emulator, state, 6, RolloutOptions(members=4)))
     assert [tuple(part.position.shape) for part in parts] == [(12, 4, 20, 2), (12, 2, 20, 2)]
-    whole = predict_members(emulator, state, 6, members=4).position
+    whole = predict_rollout(emulator, state, 6, RolloutOptions(members=4)).position
     assert torch.equal(torch.cat([part.position for part in parts], dim=1).unflatten(0, (4, 3)), whole)
-    assert predict_members(emulator, state, 0, members=4).position.shape == (4, 3, 0, 20, 2)
-    assert predict_members(emulator, state.scenes([]), 5, members=4).position.shape == (4, 0, 5, 20, 2)
+    assert predict_rollout(emulator, state, 0, RolloutOptions(members=4)).position.shape == (4, 3, 0, 20, 2)
+    assert predict_rollout(emulator, state.scenes([]), 5, RolloutOptions(members=4)).position.shape == (4, 0, 5, 20, 2)
 
 
 def test_without_nudge_each_member_is_the_deterministic_rollout():
     emulator = emulator_of(box(), processor=UNet(width=6, depth=1, perceptron=(5,)))
     state = cloud(box(), batch=2)
     one = predict_rollout(emulator, state, 9).position
-    members = predict_members(emulator, state, 9, members=3, nudge=0).position
+    members = predict_rollout(emulator, state, 9, RolloutOptions(members=3, nudge=0)).position
     assert all(torch.equal(member, one) for member in members)
 
 
@@ -93,7 +93,7 @@ def test_nudged_particles_cross_periodic_axes():
     starts = member_starts(emulator, state, members=2)
     assert bool((starts.position[..., 0] < 0.1).any())
     assert bool((starts.position != state.position).all())
-    frames = predict_members(emulator, state, 3, members=2).position
+    frames = predict_rollout(emulator, state, 3, RolloutOptions(members=2)).position
     assert float((frames[:, 0, 0] - starts.position).abs().max()) < 0.1
 
 
@@ -104,10 +104,10 @@ def test_prescribed_and_fields_are_the_same_for_all_members():
     moving = torch.linspace(0, 0.1, 12)[:, None, None] + torch.tensor([[0.2, 0.2], [0.22, 0.2]])
     emulator = emulator_of(scene)
     for given in (Prescribed.obstacles(moving), Prescribed.obstacles(moving.expand(2, -1, -1, -1))):
-        some = predict_members(emulator, state, 10, members=5, prescribed=given)
+        some = predict_rollout(emulator, state, 10, RolloutOptions(members=5, prescribed=given))
         assert some.fields["heat"].shape == (5, 2, 10, 30)
         starts = member_starts(emulator, state, members=5)
-        alone = predict_rollout(emulator, starts.scenes([7]), 10, prescribed=Prescribed.obstacles(moving))
+        alone = predict_rollout(emulator, starts.scenes([7]), 10, RolloutOptions(Prescribed.obstacles(moving)))
         torch.testing.assert_close(some.position[3, 1], alone.position[0], rtol=1e-5, atol=1e-6)
         torch.testing.assert_close(some.fields["heat"][3, 1], alone.fields["heat"][0], rtol=1e-5, atol=1e-6)
 
@@ -115,14 +115,14 @@ def test_prescribed_and_fields_are_the_same_for_all_members():
 def test_a_monitor_watches_all_members():
     emulator = emulator_of(box(), scale=3.0)
     monitor = Monitor(Policy.RECORD, speed=0.01)
-    predict_members(emulator, cloud(box()), 9, members=MOST_SCENES + 3, monitor=monitor)
+    predict_rollout(emulator, cloud(box()), 9, RolloutOptions(members=MOST_SCENES + 3, monitor=monitor))
     assert monitor.report().startswith("9 frames")
     assert monitor.incidents[0].what == "speed"
     assert monitor.peaks["speed"] > 0.01
     fast = cloud(box(), batch=MOST_SCENES + 3, speed=0)
     fast.velocity[-1] = 0.05
     monitor = Monitor(Policy.RECORD, speed=0.5)
-    predict_members(emulator_of(box(), scale=0.0), fast, 4, members=1, monitor=monitor)
+    predict_rollout(emulator_of(box(), scale=0.0), fast, 4, RolloutOptions(members=1, monitor=monitor))
     assert {incident.scene for incident in monitor.incidents if incident.what == "speed"} == {MOST_SCENES + 2}
 
 
@@ -132,4 +132,4 @@ def test_a_monitor_watches_all_members():
 )
 def test_wrong_numbers_are_named(wrong, message):
     with pytest.raises(ConfigError, match=message):
-        predict_members(emulator_of(box()), cloud(box()), 2, **{"members": 2, **wrong})
+        predict_rollout(emulator_of(box()), cloud(box()), 2, RolloutOptions(**{"members": 2, **wrong}))

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from nmpm.emulator import predict_rollout
+from nmpm.emulator import RolloutOptions, predict_rollout
 from nmpm.emulator.adaptation import adapted, with_noise
 from nmpm.emulator.noise import Noise
 from nmpm.errors import ConfigError
@@ -37,7 +37,7 @@ def test_noise_without_weights_changes_nothing(processor):
     emulator = emulator_of(box(), processor=processor)
     before = predict_rollout(emulator, state, 10).position
     other = with_noise(emulator)
-    after = predict_rollout(other, state, 10, noise=Noise(other, [0, 1])).position
+    after = predict_rollout(other, state, 10, RolloutOptions(noise=Noise(other, [0, 1]))).position
     torch.testing.assert_close(after, before, rtol=1e-5, atol=1e-6)
     assert other.recipe.processor == Stochastic(processor)
 
@@ -45,10 +45,10 @@ def test_noise_without_weights_changes_nothing(processor):
 def test_a_scene_depends_on_its_own_seed_alone():
     state = cloud(box(), batch=2, count=40)
     emulator = noisy(emulator_of(box(), processor=PROCESSORS[0]))
-    both = predict_rollout(emulator, state, 20, noise=Noise(emulator, [5, 7])).position
-    alone = predict_rollout(emulator, state.scenes([1]), 20, noise=Noise(emulator, [7])).position
+    both = predict_rollout(emulator, state, 20, RolloutOptions(noise=Noise(emulator, [5, 7]))).position
+    alone = predict_rollout(emulator, state.scenes([1]), 20, RolloutOptions(noise=Noise(emulator, [7]))).position
     torch.testing.assert_close(both[1:], alone, rtol=1e-5, atol=1e-6)
-    other = predict_rollout(emulator, state.scenes([1]), 20, noise=Noise(emulator, [8])).position
+    other = predict_rollout(emulator, state.scenes([1]), 20, RolloutOptions(noise=Noise(emulator, [8]))).position
     assert (other - alone).abs().max() > 1e-3
     without = predict_rollout(emulator, state.scenes([1]), 20).position
     assert torch.equal(without, predict_rollout(emulator, state.scenes([1]), 20).position)
@@ -58,9 +58,9 @@ def test_a_scene_depends_on_its_own_seed_alone():
 def test_kernels_and_tensors_read_the_same_noise():
     state = cloud(box(), batch=1, count=40)
     emulator = noisy(emulator_of(box(), processor=PROCESSORS[0]))
-    by_kernels = predict_rollout(emulator, state, 8, noise=Noise(emulator, [3])).position
+    by_kernels = predict_rollout(emulator, state, 8, RolloutOptions(noise=Noise(emulator, [3]))).position
     with without_kernels():
-        by_tensors = predict_rollout(emulator, state, 8, noise=Noise(emulator, [3])).position
+        by_tensors = predict_rollout(emulator, state, 8, RolloutOptions(noise=Noise(emulator, [3]))).position
     torch.testing.assert_close(by_kernels, by_tensors, rtol=1e-4, atol=1e-5)
 
 

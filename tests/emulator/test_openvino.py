@@ -104,7 +104,7 @@ import faulthandler, os, signal, sys
 faulthandler.enable()
 signal.signal(signal.SIGINT, signal.default_int_handler)  # shells make it ignored in background jobs
 from tests.scenes import box, cloud, emulator_of
-from nmpm.emulator import stream
+from nmpm.emulator import stream_rollout
 from nmpm.emulator.runtimes.openvino import SignalStack
 from nmpm.transfer import without_kernels
 
@@ -118,7 +118,7 @@ before = signal_stack()
 emulator = emulator_of(box(), 8, 3).requires_grad_(False)
 try:
     with without_kernels():  # kernels would be compiled first
-        for number, _ in enumerate(stream(emulator.with_runtime("openvino"), cloud(box()), 300)):
+        for number, _ in enumerate(stream_rollout(emulator.with_runtime("openvino"), cloud(box()), 300)):
             if number == 5:
                 print("kept", signal_stack() == before)
                 print("telemetry", [name for name in sys.modules if name.startswith("openvino_telemetry")])

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from nmpm.decoders import Flip, Residual
+from nmpm.emulator import RolloutOptions
 from nmpm.emulator.monitor import Monitor, Policy
 from nmpm.emulator.rollouts import rollout
 from nmpm.processors import Identity
@@ -47,6 +48,9 @@ def test_energy_is_that_of_the_whole_way_fallen(varies):
     scene = box(gravity=(9.81, 0.0), gravity_varies=varies, **CHANNEL)
     emulator, monitor = emulator_of(scene, decoder=Flip(), energy=True, **SILENT), Monitor(Policy.RECORD, speed=100.0)
     start = dataclasses.replace(drifting(0.02), gravity=torch.tensor([[9.81, 0.0]]) * scene.dt**2)
-    end, free = rollout(emulator, start, 200, monitor)[:, -1], start.position + 200 * start.velocity
+    end, free = (
+        rollout(emulator, start, 200, RolloutOptions(monitor=monitor))[:, -1],
+        start.position + 200 * start.velocity,
+    )
     assert (end[..., 0] >= free[..., 0] - 1e-3).all()  # no energy is lost to crossings
     assert monitor.peaks["energy"] < 0.02

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from nmpm.decoders import Absolute
-from nmpm.emulator import EmulatorRecipe, Prescribed, predict_rollout, rollout, unroll
+from nmpm.emulator import EmulatorRecipe, Prescribed, RolloutOptions, predict_rollout, rollout, unroll
 from nmpm.emulator.constraints import Constraints, mass_shares
 from nmpm.emulator.model import Emulator
 from nmpm.emulator.monitor import Monitor
@@ -55,7 +55,7 @@ def test_particles_enter_at_the_start_of_a_bundle_with_their_recorded_velocity_a
     state = state.with_motion(torch.tensor([[[0.2, 0.2], [0.8, 0.2], [0.2, 0.8], [0.8, 0.8]]]), state.velocity)
     # There all the time; until frame 6; from frame 3, so that bundle 1 has it; from frame 5, at whose start it is new.
     window = recording(scene, state, 12, presence(12, (0, 14), (0, 7), (3, 14), (5, 14)))
-    made = rollout(drifting(scene), window.initial, 12, prescribed=Prescribed.of(window))
+    made = rollout(drifting(scene), window.initial, 12, RolloutOptions(Prescribed.of(window)))
     there = made.isfinite().all(-1)[0]
     assert there.T.tolist() == [
         [True] * 12,
@@ -75,7 +75,7 @@ def test_a_particle_that_was_absent_for_a_frame_is_another_one_afterwards():
     window.present = torch.ones(1, 14, 2, dtype=torch.bool)
     window.present[0, 3, 1] = False
     window.frames[0, 4:, 1] = torch.tensor([0.2, 0.2])  # somebody else, far away
-    made = rollout(drifting(scene), window.initial, 12, prescribed=Prescribed.of(window))
+    made = rollout(drifting(scene), window.initial, 12, RolloutOptions(Prescribed.of(window)))
     torch.testing.assert_close(made[0, 4:, 1], window.target[0, 4:, 1], atol=1e-6, rtol=0)
     assert predicted_particles(window.present, FRAMES)[0, :, 1].tolist() == [True] + [False] * 3 + [True] * 8
     trivial = predict_from_entries(still, window, FRAMES)
@@ -90,7 +90,7 @@ def test_a_rollout_predicts_those_that_scores_count_whatever_the_presence(seed, 
     state = cloud(scene, 12, batch=2)
     window = recording(scene, state, 9, torch.rand(2, 11, 12) < 0.7)
     emulator = silenced(emulator_of(scene, frames=frames)).requires_grad_(False)
-    made = rollout(emulator, window.initial, 9, prescribed=Prescribed.of(window))
+    made = rollout(emulator, window.initial, 9, RolloutOptions(Prescribed.of(window)))
     counts = with_predicted(window, frames).present[:, 2:]
     assert torch.equal(made.isfinite().all(-1), counts)
     trivial = predict_from_entries(still, window, frames)
@@ -108,10 +108,10 @@ def test_who_is_not_there_changes_nothing_for_the_others_to_the_bit(kernels):
     window = recording(scene, state, 12, presence(12, *spans))
     moved = dataclasses.replace(window, frames=torch.where(window.present.unsqueeze(-1), window.frames, 0.31))
     if kernels:
-        one, other = (rollout(emulator, w.initial, 12, prescribed=Prescribed.of(w)) for w in (window, moved))
+        one, other = (rollout(emulator, w.initial, 12, RolloutOptions(Prescribed.of(w))) for w in (window, moved))
     else:
         with without_kernels():
-            one, other = (rollout(emulator, w.initial, 12, prescribed=Prescribed.of(w)) for w in (window, moved))
+            one, other = (rollout(emulator, w.initial, 12, RolloutOptions(Prescribed.of(w))) for w in (window, moved))
     assert torch.equal(one.nan_to_num(7.0), other.nan_to_num(7.0))
     assert one[0, 8:, 12:].isnan().all()
 
@@ -122,7 +122,7 @@ def test_scores_of_all_predictors_are_over_the_same_particles():
     window = recording(scene, state, 8, presence(8, (0, 10), (3, 10), (0, 5)))
     comparison = Comparison(scene, [MSE((4,)), EarthMover(4)], FRAMES)
     emulator = drifting(scene)
-    comparison.update(window, rollout(emulator, window.initial, 8, prescribed=Prescribed.of(window)))
+    comparison.update(window, rollout(emulator, window.initial, 8, RolloutOptions(Prescribed.of(window))))
     errors = comparison.compute()
     speed = state.velocity[0].square().mean(-1)
     # Frames 1 … 4 of those there from the start, the third until frame 3; 1 … 4 after its entry of the second.
@@ -144,7 +144,7 @@ def test_a_recording_in_which_all_stay_is_rolled_out_to_the_bit_as_without_prese
     whole = dataclasses.replace(window, present=torch.ones(1, 10, 20, dtype=torch.bool))
     plain = rollout(emulator, window.initial, 8)
     assert Prescribed.of(window) is None
-    assert torch.equal(rollout(emulator, whole.initial, 8, prescribed=Prescribed.of(whole)), plain)
+    assert torch.equal(rollout(emulator, whole.initial, 8, RolloutOptions(Prescribed.of(whole))), plain)
 
 
 @pytest.mark.parametrize("kernels", [True, False])
@@ -155,7 +155,7 @@ def test_particles_leave_through_an_open_axis_and_not_through_walls(kernels):
     state = cloud(scene, 4).with_motion(position, velocity)
     emulator, monitor = drifting(scene, cells=40), Monitor()
     assert emulator.walls[:, 20].max() < 1e-6 < 0.5 < emulator.walls[20, 0]
-    with_kernels = rollout(emulator, state, 12, monitor)
+    with_kernels = rollout(emulator, state, 12, RolloutOptions(monitor=monitor))
     with without_kernels():
         made = with_kernels if kernels else rollout(emulator, state, 12)
     assert made[0, :4].isfinite().all()
@@ -174,7 +174,7 @@ def test_energy_is_not_limited_where_it_comes_in_which_is_said():
     window = recording(scene, cloud(scene, 5), 4, presence(4, *[(0, 6)] * 5))
     emulator = emulator_of(scene, frames=FRAMES, energy=True, scale=0.01).requires_grad_(False)
     with pytest.warns(UserWarning, match="energy does not act"):
-        predict_rollout(emulator, window.initial, 4, prescribed=Prescribed.of(window))
+        predict_rollout(emulator, window.initial, 4, RolloutOptions(Prescribed.of(window)))
 
 
 def paddle(column: float) -> torch.Tensor:
@@ -209,7 +209,7 @@ def test_the_motion_of_obstacles_changes_the_prediction_and_the_solid_moves_on()
     state = with_obstacle(cloud(PADDLE), paddle(0.3))
     still_frames, moving = paddle_frames(0.0, 9), paddle_frames(0.004, 9)
     one, other = (
-        rollout(emulator, state, 8, prescribed=Prescribed.obstacles(frames)) for frames in (still_frames, moving)
+        rollout(emulator, state, 8, RolloutOptions(Prescribed.obstacles(frames))) for frames in (still_frames, moving)
     )
     assert (one[:, :FRAMES] - other[:, :FRAMES]).abs().max() > 1e-6
     assert torch.equal(rollout(emulator, state, 8), one)  # without velocity is as at rest
@@ -219,9 +219,9 @@ def test_a_rollout_goes_on_from_its_state_to_the_bit():
     emulator = emulator_of(PADDLE, frames=FRAMES, scale=0.05).requires_grad_(False)
     frames = paddle_frames(0.004, 2 * FRAMES + 1)
     state = with_obstacle(cloud(PADDLE), frames[0])
-    first, second = unroll(emulator, state, 2, prescribed=Prescribed.obstacles(frames))
+    first, second = unroll(emulator, state, 2, RolloutOptions(Prescribed.obstacles(frames)))
     middle = first.state_after(state)
-    (again,) = unroll(emulator, middle, 1, prescribed=Prescribed.obstacles(frames[FRAMES:]))
+    (again,) = unroll(emulator, middle, 1, RolloutOptions(Prescribed.obstacles(frames[FRAMES:])))
     assert torch.equal(again.position, second.position)
     assert torch.equal(again.velocity, second.velocity)
 
@@ -232,7 +232,7 @@ def test_a_paddle_pushes_particles_before_it_and_never_lets_them_through(scene):
     frames = paddle_frames(0.006, 4 * FRAMES + 1)
     block = lattice(((0.38, 0.46), (0.4, 0.6)), 0.02).float()
     state = cloud(PADDLE, len(block)).with_motion(block.unsqueeze(0), torch.zeros(1, len(block), 2))
-    made = rollout(emulator, with_obstacle(state, frames[0]), 4 * FRAMES, prescribed=Prescribed.obstacles(frames))
+    made = rollout(emulator, with_obstacle(state, frames[0]), 4 * FRAMES, RolloutOptions(Prescribed.obstacles(frames)))
     front = frames[1:, :, 0].amax(1)
     behind = made[0, ..., 0].amin(1) - front
     assert (behind > -0.02).all()  # one cell
@@ -243,7 +243,7 @@ def test_prescribed_obstacles_must_be_those_of_the_state():
     emulator = emulator_of(PADDLE, frames=FRAMES).requires_grad_(False)
     state = with_obstacle(cloud(PADDLE), paddle(0.3))
     with pytest.raises(DataError, match="Prescribed obstacle particles have the shape"):
-        rollout(emulator, state, 4, prescribed=Prescribed.obstacles(paddle_frames(0.0, 5)[:, :-1]))
+        rollout(emulator, state, 4, RolloutOptions(Prescribed.obstacles(paddle_frames(0.0, 5)[:, :-1])))
     with pytest.raises(DataError, match="finite"):
         Prescribed.obstacles(paddle_frames(float("nan"), 5))
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nmpm.decoders import Absolute
-from nmpm.emulator import Emulator, unroll
+from nmpm.emulator import Emulator, RolloutOptions, unroll
 from nmpm.emulator.engines.torch.support import REACH, Support
 from nmpm.emulator.monitor import Monitor
 from nmpm.emulator.rollouts import rollout
@@ -131,7 +131,7 @@ def test_only_scenes_that_move_are_computed():
     batch = cloud(WEIGHTLESS, batch=3, speed=0.02)
     batch.velocity[::2] = 0.0
     expected, sizes, monitor = called_each_time(emulator, batch), scenes_computed(emulator), Monitor()
-    predicted = [bundle.position for bundle in unroll(emulator, batch, BUNDLES, monitor)]
+    predicted = [bundle.position for bundle in unroll(emulator, batch, BUNDLES, RolloutOptions(monitor=monitor))]
     assert 0.6 < monitor.rest_share < 0.75
     assert f"{monitor.rest_share:.0%} of all at rest" in monitor.report()
     assert (sizes[0], sizes[-1]) == (3, 1)

@@ -5,12 +5,12 @@ import dataclasses
 import pytest
 import torch
 
-from nmpm.emulator import predict_rollout
-from nmpm.emulator.members import predict_members
+from nmpm.emulator import RolloutOptions, predict_rollout, stream_rollout
 from nmpm.emulator.monitor import Monitor, Policy
-from nmpm.emulator.trust import Trust, TrustTracker, calibrate, stream_watched, until_trusted
-from nmpm.errors import DataError
+from nmpm.emulator.trust import Trust, TrustTracker
+from nmpm.errors import ConfigError, DataError
 from nmpm.particles import lattice, state_at_rest
+from nmpm.zoo.measures.model import calibrate_trust
 from tests.scenes import box, cloud, emulator_of, window_of
 
 SCENE = box()  # of 14 x 14 cells of 3 particle spacings
@@ -79,8 +79,10 @@ def wild(batch=1, seed=0):
 
 def rollout_until_trusted(emulator, state, frames, trust, members=None):
     tracker = TrustTracker(SCENE, state, trust)
-    parts = list(until_trusted(stream_watched(emulator, state, frames, tracker, members), tracker))
-    return torch.cat([part.position for part in parts], dim=1), tracker
+    options = RolloutOptions(members=members, tracker=tracker, until_trusted=True)
+    made = predict_rollout(emulator, state, frames, options)
+    assert torch.equal(made.trusted, tracker.frames)
+    return made.position, tracker
 
 
 def test_a_rollout_until_it_is_trusted_is_the_beginning_of_the_full_one():
@@ -97,10 +99,10 @@ def test_a_rollout_until_it_is_trusted_is_the_beginning_of_the_full_one():
 def test_a_monitor_reports_the_last_trusted_frame():
     (emulator, state), monitor = wild(), Monitor(Policy.RECORD)
     tracker = TrustTracker(SCENE, state, Trust(limit=0.05, scenes=8))
-    list(stream_watched(emulator, state, 60, tracker, monitor=monitor))
+    list(stream_rollout(emulator, state, 60, RolloutOptions(monitor=monitor, tracker=tracker)))
     assert "this scene is one of many" in tracker.report()
     assert monitor.report().endswith(tracker.report())
-    predict_rollout(emulator, state, 4, monitor)
+    predict_rollout(emulator, state, 4, RolloutOptions(monitor=monitor))
     assert "trust" not in monitor.report().lower()
 
 
@@ -116,8 +118,8 @@ def test_scenes_that_are_lost_earlier_are_nan_from_then_on():
 def test_members_are_compared_with_each_other():
     emulator, state = wild()
     ended, tracker = rollout_until_trusted(emulator, state, 60, Trust(limit=0.05), members=4)
-    full = predict_members(emulator, state, 60, 4).position
-    assert torch.equal(ended, full[:, 0, : int(tracker.frames)])
+    full = predict_rollout(emulator, state, 60, RolloutOptions(members=4)).position
+    assert torch.equal(ended, full[:, :, : int(tracker.frames)])
 
 
 def test_the_limit_is_that_by_which_frames_are_nearest_to_the_true_ones():
@@ -139,9 +141,14 @@ def test_calibration_on_scenes_that_the_model_made_trusts_it_as_far_as_it_may():
     emulator, state = wild()
     path = torch.cat([(state.position - state.velocity)[:, None], state.position[:, None]], dim=1)
     window = window_of(state, torch.cat([path, predict_rollout(emulator, state, 24).position], dim=1))
-    fitted = calibrate(emulator, iter([window]))
+    fitted = calibrate_trust(emulator, iter([window]))
     assert fitted.scenes == 1
     assert rollout_until_trusted(emulator, state, 24, fitted)[0].shape[1] == 24
+
+
+def test_frames_cannot_be_trusted_without_a_tracker():
+    with pytest.raises(ConfigError, match="until_trusted: a tracker says which frames are"):
+        RolloutOptions(until_trusted=True)
 
 
 def test_cards_state_trust_and_nonsense_is_the_default():

@@ -10,7 +10,7 @@ from torch.optim import Adam
 
 from nmpm.cli import main
 from nmpm.data.format import Split, Trajectory, write_metadata, write_split
-from nmpm.emulator import Prescribed, rollout
+from nmpm.emulator import Prescribed, RolloutOptions, rollout
 from nmpm.emulator.calibration import calibrate
 from nmpm.grid import Grid
 from nmpm.particles import Window
@@ -116,7 +116,7 @@ def test_a_paddle_is_seen_and_not_scored(paddled, tmp_path):
     emulator = module.emulator.eval()
     frames = window.target.shape[1]
     with torch.no_grad():
-        moved = rollout(emulator, window.initial, frames, prescribed=Prescribed.of(window))
+        moved = rollout(emulator, window.initial, frames, RolloutOptions(Prescribed.of(window)))
         resting = rollout(emulator, window.initial, frames)
     truth = window.target
     assert (moved - truth).square().mean() < (resting - truth).square().mean()

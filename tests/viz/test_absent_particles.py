@@ -9,7 +9,7 @@ import torch
 
 from nmpm.data.format import Split, write_split
 from nmpm.data.predictions import predicted_trajectory
-from nmpm.emulator import Prescribed, rollout
+from nmpm.emulator import Prescribed, RolloutOptions, rollout
 from nmpm.errors import DataError
 from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.particles import Window
@@ -38,7 +38,7 @@ def window() -> Window:
 @pytest.fixture
 def predicted(window) -> torch.Tensor:
     emulator = silenced(emulator_of(SCENE, frames=4)).requires_grad_(False)
-    return rollout(emulator, window.initial, FRAMES, prescribed=Prescribed.of(window))
+    return rollout(emulator, window.initial, FRAMES, RolloutOptions(Prescribed.of(window)))
 
 
 @pytest.fixture

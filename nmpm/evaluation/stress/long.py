@@ -8,8 +8,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-from nmpm.emulator import Emulator
-from nmpm.emulator.rollouts import stream
+from nmpm.emulator import Emulator, stream_rollout
 from nmpm.evaluation.stress.model import ModelUnderTest, simulate_beside, simulate_window
 from nmpm.evaluation.stress.results import Effort, TestResult
 from nmpm.evaluation.stress.trace import INVARIANTS, Trace, filled_volume, trace_rollout
@@ -142,7 +141,8 @@ def settling(model: ModelUnderTest, effort: Effort) -> Iterator[TestResult]:
 def _predict_frames(emulator: Emulator, state: Particles, frames: Sequence[int]) -> Tensor:
     """Positions (B, F, N, D) of a rollout at frames, which count from 1; only one bundle is kept at a time."""
     kept, made = [], 0
-    for bundle in stream(emulator, state, max(frames)):
-        kept += [bundle[:, frame - made - 1] for frame in frames if made < frame <= made + bundle.shape[1]]
-        made += bundle.shape[1]
+    for part in stream_rollout(emulator, state, max(frames)):
+        ahead = part.position.shape[1]
+        kept += [part.position[:, frame - made - 1] for frame in frames if made < frame <= made + ahead]
+        made += ahead
     return torch.stack(kept, dim=1)

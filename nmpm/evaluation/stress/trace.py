@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from nmpm.emulator import Emulator
+from nmpm.emulator import Emulator, stream_rollout
 from nmpm.emulator.constraints import MOST_GAIN, lowest_potential, mass_shares
 from nmpm.emulator.monitor import beyond_walls
 from nmpm.emulator.rasterise import volume_fraction
-from nmpm.emulator.rollouts import stream
 from nmpm.grid import Grid
 from nmpm.particles import Particles
 from nmpm.scene import Scene
@@ -104,7 +103,8 @@ def trace_bundles(emulator: Emulator, start: Particles, bundles: Iterable[Tensor
 
 def trace_rollout(emulator: Emulator, start: Particles, frames: int, every: int = 0) -> Trace:
     """Roll out and measure, keeping the last positions only."""
-    return trace_bundles(emulator, start, stream(emulator, start, frames), every)
+    positions = (part.position for part in stream_rollout(emulator, start, frames))
+    return trace_bundles(emulator, start, positions, every)
 
 
 def energy_above_lowest(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -> Tensor:

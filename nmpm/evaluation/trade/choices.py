@@ -17,9 +17,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from nmpm._support.messages import one_line
-from nmpm.emulator import Emulator, Prescribed, rollout
+from nmpm.emulator import Emulator, Prescribed, RolloutOptions, rollout
 from nmpm.emulator.digests import weights_digest
-from nmpm.emulator.members import predict_members
 from nmpm.emulator.prescribed import predict_from_entries, with_predicted
 from nmpm.errors import ConfigError, DataError
 from nmpm.evaluation.matched import MatchedPredictor
@@ -152,7 +151,7 @@ class ModelChoice(Choice):
             there = window.to(self.device)
             return lambda frames: matched.predict(there.first(frames + 2))
         state, prescribed = self._start(window)
-        return lambda frames: rollout(self.emulator, state, frames, prescribed=prescribed)
+        return lambda frames: rollout(self.emulator, state, frames, RolloutOptions(prescribed))
 
     def _start(self, window: Window) -> tuple[Particles, Prescribed | None]:
         """What a rollout of a window starts from, and what is prescribed to it, on the choice's device."""
@@ -330,9 +329,9 @@ class MembersChoice(ModelChoice):
     def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
         (index,) = indices
         start, prescribed = self._start(scenes.window(indices))
+        options = RolloutOptions(prescribed, members=self.members, seed=index, nudge=self.nudge)
 
         def predict(frames: int) -> Tensor:
-            members = predict_members(self.emulator, start, frames, self.members, index, self.nudge, prescribed)
-            return members.position[:, 0]
+            return rollout(self.emulator, start, frames, options)[:, 0]
 
         return predict

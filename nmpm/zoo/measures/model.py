@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from nmpm._support.progress import progress_bar
-from nmpm.emulator import Prescribed
+from nmpm.emulator import Emulator, Prescribed, RolloutOptions, stream_rollout
 from nmpm.emulator.prescribed import with_predicted
-from nmpm.emulator.trust import calibrate
+from nmpm.emulator.trust import Trust, TrustTracker
 from nmpm.evaluation.bootstrap import interval
 from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.evaluation.prediction_errors import Measures, measure_errors
@@ -62,7 +64,25 @@ def quality_facts(model: Pretrained, folder: Path, data: Path | None) -> dict[st
 def trust_facts(model: Pretrained, data: Path | None) -> dict[str, Any]:
     """The key `trust` of a card, see `nmpm.emulator.trust.Trust`, calibrated on the validation scenes."""
     windows = iterate_scenes(f"trust of {model.name}", model, data, TRUST_SCENES, split="valid")
-    return {"trust": calibrate(model.emulator, windows).to_card()}
+    return {"trust": calibrate_trust(model.emulator, windows).to_card()}
+
+
+def calibrate_trust(emulator: Emulator, windows: Iterable[Window]) -> Trust:
+    """The trust of an emulator on recorded scenes, each the only one of a window.
+
+    Raises:
+        DataError: if there is none.
+    """
+    members, truth = [], []
+    for window in windows:
+        state, frames = window.initial, window.target.shape[1]
+        beside, apart = (TrustTracker(emulator.scene, state, Trust()) for _ in range(2))
+        for part in stream_rollout(emulator, state, frames, RolloutOptions(Prescribed.of(window), tracker=beside)):
+            recorded = window.target[:, apart.made : beside.made]
+            apart.see(torch.stack([part.position, recorded.to(part.position)]))
+        members.append(beside.curve[0])
+        truth.append(apart.curve[0])
+    return Trust.fit(members, truth)
 
 
 def stress_facts(model: Pretrained) -> dict[str, Any]:
