@@ -27,8 +27,7 @@ from nmpm.data.hdf5 import FILTERS
 from nmpm.data.sources import FolderSource
 from nmpm.errors import NmpmError
 from tests.data.convert import records
-from tests.data.convert.test_gns_npz import pair
-from tests.data.convert.test_rollout_pickle import rollout
+from tests.data.convert.test_pickles import pair, rollout
 from tests.data.fuzzing import damage, random_changes
 
 ROOT = Path(__file__).parents[2]
@@ -232,8 +231,8 @@ def gsd(folder):
 
 
 def h5md(folder):
-    from tests.data.convert.test_h5md import RUN as POSITIONS
-    from tests.data.convert.test_h5md import STEPS, write
+    from tests.data.convert.test_hdf5_frames import RUN as POSITIONS
+    from tests.data.convert.test_hdf5_frames import STEPS, write
 
     write(folder / "run.h5md", {"all": {"position": (POSITIONS, STEPS), "id": np.arange(POSITIONS.shape[1])}})
 

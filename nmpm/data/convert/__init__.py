@@ -35,16 +35,16 @@ READERS: Registry[type[Reader]] = Registry(
     {
         "native": "nmpm.data.convert.native:Native",
         "deepmind": "nmpm.data.convert.deepmind:DeepMind",
-        "gns-npz": "nmpm.data.convert.gns_npz:GnsNpz",
+        "gns-npz": "nmpm.data.convert.pickles:GnsNpz",
         "neuralmpm": "nmpm.data.convert.neuralmpm:NeuralMpm",
         "dmcf": "nmpm.data.convert.dmcf:Dmcf",
         "rollout-pickle": "nmpm.data.convert.pickles:RolloutPickle",
         "native-files": "nmpm.data.convert.native:NativeFiles",
         "h5md": "nmpm.data.convert.h5md:H5md",
         "arrays": "nmpm.data.convert.array_files:ArrayFiles",
-        "array-frames": "nmpm.data.convert.array_frames:ArrayFrames",
+        "array-frames": "nmpm.data.convert.array_files:ArrayFrames",
         "csv-frames": "nmpm.data.convert.tables:CsvFrames",
-        "tracks": "nmpm.data.convert.tracks:Tracks",
+        "tracks": "nmpm.data.convert.tables:Tracks",
         "vtk": "nmpm.data.convert.vtk:Vtk",
         "vtkhdf": "nmpm.data.convert.vtkhdf:VtkHdf",
         "ply": "nmpm.data.convert.ply:Ply",
@@ -101,14 +101,20 @@ def _detect(path: Path, files: str | None = None) -> Reader:
         raise DataError(f"{path}: the file is empty. Copy, download or write it again.")
     inside = sorted(path.glob("*")) if path.is_dir() else ()
     inner = list(islice((each for each in inside if each.is_dir() and not is_no_data(each.name)), _MOST_INNER))
-    if sum(map(_has_splits, inner)) < 2:
+    split_in = (folder for folder in inner if folder.name not in SPLITS)
+    with_splits = [folder for folder in split_in if any(file.name.split(".")[0] in SPLITS for file in folder.glob("*"))]
+    if len(with_splits) < 2:
         for reader in _readers_to_try(path, files):
             with suppress(NmpmError, OSError):
                 if reader.recognises(path):
                     return reader
     if files is not None:
         raise DataError(f"{path}: --files {files}: no file of these names is of a format that is read.")
-    datasets = [folder for folder in inner if _is_dataset(folder)]
+    datasets = list[Path]()
+    for folder in inner:
+        with suppress(NmpmError, OSError):
+            _detect(folder)
+            datasets.append(folder)
     raise DataError(describe_several(path, datasets) if datasets else describe_unknown(path))
 
 
@@ -121,20 +127,8 @@ def _readers_to_try(path: Path, files: str | None) -> Iterator[Reader]:
             reader = kind() if files is None else kind().select(files)
             if by_content:
                 yield reader.with_any_name()
-            elif not path.is_file() or not kind.patterns or is_selected(Path(path.name), kind.patterns):
+            elif not path.is_file() or is_selected(Path(path.name), kind.patterns):
                 yield reader
-
-
-def _is_dataset(folder: Path) -> bool:
-    """Whether a folder is of a known format, as a whole."""
-    with suppress(NmpmError, OSError):
-        return bool(_detect(folder))
-    return False
-
-
-def _has_splits(folder: Path) -> bool:
-    """Whether a folder has files or folders called train, valid or test, and is a dataset of its own."""
-    return folder.name not in SPLITS and any(inner.name.split(".")[0] in SPLITS for inner in folder.glob("*"))
 
 
 def convert(
@@ -205,7 +199,11 @@ def native_file(path: Path, split: str | None = None, options: Options | None = 
         ConfigError: if they have no such split.
     """
     as_stored = options is None or not options.changes_positions
-    if _is_native_file(path):
+    is_native_file = False  # with its scene described within or beside it
+    if path.is_file():
+        with suppress(DataError, IndexError):
+            is_native_file = "scene" in Split(path).attributes(0) or (path.parent / METADATA_FILE).is_file()
+    if is_native_file:
         if split is not None:
             raise ConfigError(f"--split {split}: {path} is the file of a split; leave it out, or name the folder.")
         if as_stored:
@@ -214,17 +212,6 @@ def native_file(path: Path, split: str | None = None, options: Options | None = 
     if split is not None and split not in paths:
         raise ConfigError(f"--split {split}: {path} has {', '.join(paths)}.")
     return paths[split] if split is not None else paths.get("test", next(iter(paths.values())))
-
-
-def _is_native_file(path: Path) -> bool:
-    """Whether a file has the native layout, with its scene described within or beside it."""
-    if not path.is_file():
-        return False
-    try:
-        described = "scene" in Split(path).attributes(0)
-    except (DataError, IndexError):
-        return False
-    return described or (path.parent / METADATA_FILE).is_file()
 
 
 def _fingerprint(path: Path, options: Options, format_name: str | None) -> str:

@@ -1,8 +1,9 @@
 """Files of arrays under usual names: NumPy's `.npz` and `.npy`, HDF5, MATLAB's `.mat`, and folders of them.
 
 A file holds one run, or several: stacked, numbered, or in groups (`nmpm.data.convert.run_arrays`). A folder of `.npy`
-files of which one is called positions, and the others types, velocities and the like, is one run. Objects are not
-unpickled.
+files of which one is called positions, and the others types, velocities and the like, is one run. Or a file holds a
+frame, or HDF5 a group for each frame: positions are (N, D), or x, y and z (N,), or columns of a table that are called
+so (CB-Geo); groups that have positions, such as PySPH's fluid and boundary, are materials. Objects are not unpickled.
 
 MATLAB's files of v7.3 are HDF5; older ones are read by scipy in a child process. Fields of structs are named
 `struct/field`, entries of cells `cell_0`, `cell_1`, …; axes of one are left out, as MATLAB adds them to vectors and
@@ -16,8 +17,9 @@ import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -28,11 +30,25 @@ from nmpm._support.bounded_files import EXPANSION, NPZ_ERRORS, check_regular, ex
 from nmpm._support.isolated import call_isolated
 from nmpm._support.messages import one_line
 from nmpm.data.convert.base import Facts, Options, Run, RunFiles, readable, split_files
-from nmpm.data.convert.named_arrays import USUAL_NAMES, ArrayLike, Arrays, describe, plain_name
+from nmpm.data.convert.frame_files import FrameFormat, by_kind, has_other_word
+from nmpm.data.convert.frames import Frame, join_frames
+from nmpm.data.convert.named_arrays import (
+    USUAL_NAMES,
+    ArrayLike,
+    Arrays,
+    by_folder,
+    by_plain_name,
+    component_names,
+    describe,
+    plain_name,
+    with_meaning,
+)
 from nmpm.data.convert.run_arrays import group_runs
 from nmpm.data.format import VTKHDF, Metadata, Trajectory, is_no_data
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
-from nmpm.errors import DataError
+from nmpm.errors import DataError, NmpmError
+
+_FRAME_NAME = re.compile(r"(?:arr|frame|iter|iteration|output|snapshot|state|step|t|time|timestep)?[_#. -]?(\d{1,18})")
 
 
 class ArrayFiles(RunFiles):
@@ -72,6 +88,101 @@ class ArrayFiles(RunFiles):
             for index, (group, run) in enumerate(runs):
                 if index in wanted:
                     yield group.read(run, metadata)
+
+
+class ArrayFrames(FrameFormat):
+    """A file, or a group, per frame."""
+
+    summary: ClassVar[str] = "a file per frame of arrays in .npz, .npy, .h5, .hdf5: positions (N, D), or x, y, z"
+    patterns: tuple[str, ...] = ArrayFiles.patterns
+
+    def recognises(self, path: Path) -> bool:
+        for first, *others in by_kind(self.first_files(path)).values():
+            with suppress(NmpmError, OSError):
+                if len(list(islice(self.frames(first), 2))) + bool(others) > 1:
+                    return True
+        return False
+
+    def frames(self, file: Path) -> Iterator[Frame]:
+        with open_arrays(file) as arrays:
+            for name, inside in _by_frame(arrays).items():
+                yield _frame(inside, f"{file}: {name}" if name else str(file))
+
+    def count(self, file: Path) -> int:
+        with open_arrays(file) as arrays:
+            return len(_by_frame(arrays))
+
+
+def _by_frame(arrays: Arrays) -> dict[str, dict[str, ArrayLike]]:
+    """The arrays of each frame: of a group, or an array, that is called like one; else those of the whole file."""
+    plain: dict[str, ArrayLike] = {}  # with the columns of tables
+    for name, array in arrays.items():
+        if array.dtype.names:
+            table = np.asarray(array[()]).reshape(-1)
+            plain |= {f"{name}/{column}": table[column] for column in array.dtype.names}
+        else:
+            plain[name] = array
+    frames: dict[str, dict[str, ArrayLike]] = {}
+    for name, array in plain.items():
+        group, _, inner = name.partition("/")
+        if _FRAME_NAME.fullmatch(group.lower()):
+            frames.setdefault(group, {})[inner or "position"] = array
+    holders = [name for name, inside in frames.items() if any(map(_position, by_folder(inside).values()))]
+    holders.sort(key=lambda name: int(re.findall(r"\d+", name)[-1]))
+    return {name: frames[name] for name in holders} or {"": plain}
+
+
+def _frame(arrays: Arrays, where: str) -> Frame:
+    groups = {name: inside for name, inside in by_folder(arrays).items() if _position(inside)}
+    groups = {name: inside for name, inside in groups.items() if not has_other_word(name)} or groups
+    if not groups:
+        raise DataError(f"{where}: no array can be positions (N, D) or x, y, z ({describe(arrays)}).")
+    numbers = {
+        name.rpartition("/")[2]: array
+        for name, array in arrays.items()
+        if array.shape in ((), (1,)) and array.dtype.kind in "iuf"
+    }
+
+    def fact(meaning: str) -> float | None:
+        named = with_meaning(meaning, numbers)
+        return float(np.asarray(numbers[named[0]][()]).reshape(-1)[0]) if named else None
+
+    time, step = fact("time"), fact("step")
+    whole = None if step is None else int(step)
+    shared = set.intersection(*(set(group.split("/")) for group in groups))
+    parts = list[tuple[str, Frame]]()
+    for group, inside in groups.items():
+        material = "_".join(part for part in group.split("/") if part not in shared) or "particles"
+        parts.append((material, _particles(inside, time, whole)))
+    return join_frames(parts) if len(parts) > 1 else parts[0][1]
+
+
+def _position(arrays: Arrays) -> tuple[str, ...]:
+    """Names of the positions of a frame, or of their components; () if there are none."""
+    for name in with_meaning("position", arrays):
+        *one, count, dim = arrays[name].shape if len(arrays[name].shape) > 1 else (0, 0)
+        if dim in (2, 3) and count > 0 and one in ([], [1]) and arrays[name].dtype.kind in "iuf":
+            return (name,)
+    flat = [name for name, array in arrays.items() if len(array.shape) == 1 and array.dtype.kind in "iuf"]
+    names = component_names(by_plain_name(flat), "position")
+    return names if len({arrays[name].shape for name in names}) == 1 else ()
+
+
+def _particles(arrays: Arrays, time: float | None, step: int | None) -> Frame:
+    names = _position(arrays)
+    parts = [np.asarray(arrays[name][()], np.float64) for name in names]
+    position = np.stack(parts, axis=1) if len(parts) > 1 else parts[0].reshape(-1, parts[0].shape[-1])
+    values: dict[str, np.ndarray] = {}
+    for name, array in arrays.items():
+        shape = tuple(array.shape)
+        shape = shape[1:] if len(shape) > 1 and shape[0] == 1 != len(position) else shape
+        if name not in names and shape[:1] == (len(position),) and array.dtype.kind in "biufSU":
+            flat = np.asarray(array[()]).reshape(len(position), -1)
+            values[name] = flat[:, 0] if len(shape) == 1 else flat
+    left_out = tuple(
+        name for name, array in arrays.items() if name not in values and name not in names and len(array.shape) > 0
+    )
+    return Frame(position, values, time, step, left_out=left_out)
 
 
 def is_array_folder(path: Path) -> bool:

@@ -17,7 +17,7 @@ from functools import partial
 from importlib.util import find_spec
 from itertools import groupby
 from pathlib import Path, PurePosixPath
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -43,16 +43,28 @@ _CUT = "Cut along time: the first 80% of the frames train, then 10% valid, 10% t
 
 
 @dataclass(frozen=True)
+class Facts:
+    """Facts that the files of a dataset state."""
+
+    metadata: Metadata  # with placeholders for what is unknown
+    unknown: frozenset[str] = frozenset()  # fields of the metadata that are to be found in the trajectories
+    notes: tuple[str, ...] = ()  # for the user, on assumptions and inconsistencies
+    assumed: frozenset[str] = frozenset()  # fields of the metadata that the files do not state
+    steps: bool = False  # whether times are numbers of a simulator's steps, of a length that the files do not state
+    has_family: bool = False  # whether the types are named by the family that the user states, where he does
+
+
+@dataclass(frozen=True)
 class ForeignDataset:
-    """An opened dataset of another format."""
+    """An opened dataset of another format: its `Facts`, as the user corrects them, and its trajectories."""
 
     metadata: Metadata
     splits: Mapping[str, Callable[[], Iterator[Trajectory]]]  # of "train", "valid", "test": starts to read trajectories
-    notes: tuple[str, ...] = ()  # for the user, on assumptions and inconsistencies
+    notes: tuple[str, ...] = ()
     counts: Mapping[str, int] = field(default_factory=dict)  # trajectories of the splits, as far as they are counted
-    assumed: frozenset[str] = frozenset()  # fields of the metadata that the files do not state
-    unknown: frozenset[str] = frozenset()  # fields of the metadata that are to be found in the trajectories
-    steps: bool = False  # whether times are numbers of a simulator's steps, of a length that the files do not state
+    assumed: frozenset[str] = frozenset()
+    unknown: frozenset[str] = frozenset()
+    steps: bool = False
     whole: ForeignDataset | None = None  # the same without cuts, where runs were cut along time into splits
 
     def map(self, change: Callable[[Trajectory], Trajectory], metadata: Metadata | None = None) -> ForeignDataset:
@@ -63,18 +75,6 @@ class ForeignDataset:
 
         splits = {name: partial(changed, start) for name, start in self.splits.items()}
         return replace(self, splits=splits, metadata=metadata or self.metadata)
-
-
-@dataclass(frozen=True)
-class Facts:
-    """Facts that the first file of a dataset states, before the user's corrections."""
-
-    metadata: Metadata  # with placeholders for what is unknown
-    unknown: frozenset[str] = frozenset()  # fields of the metadata that are to be found in the trajectories
-    notes: tuple[str, ...] = ()  # for the user
-    assumed: frozenset[str] = frozenset()  # fields of the metadata that the files do not state
-    steps: bool = False  # whether times are numbers of a simulator's steps
-    has_family: bool = False  # whether the types are named by the family that the user states, where he does
 
 
 def placeholder_metadata(dim: int, **facts: Any) -> Metadata:
@@ -129,30 +129,25 @@ class Reader(abc.ABC):
 
 @dataclass(frozen=True)
 class Run:
-    """A run in a file."""
+    """A run: one of those in a file, or a folder with a file per frame."""
 
     file: Path
     index: int  # which of the file's runs it is
     frames: int = 0  # 0 where a run must be read to count them
     split: str | None = None  # where names in the file state one
     part: range | None = None  # frames to take; None for all
-
-    def take(self, trajectory: Trajectory) -> Trajectory:
-        """The part of its whole trajectory."""
-        return trajectory if self.part is None else cut(trajectory, self.part)
-
-
-SomeRun = TypeVar("SomeRun", bound=Run)
+    source: Any = None  # further knowledge of the reader, on where its frames are
 
 
 class RunFiles(Reader):
     """Abstract reader of a format whose files hold one run or several each, one subclass per format.
 
     Attributes:
-        unsplit: The split of files that nothing divides; "all" is divided by `divide`.
+        family: Of formats that describe their scene: the meaning of type ids where the user names none. Files that
+            nothing divides are tests then.
     """
 
-    unsplit: ClassVar[str] = "all"
+    family: ClassVar[str] = ""
 
     def recognises(self, path: Path) -> bool:
         return bool(self.files(path))
@@ -170,8 +165,8 @@ class RunFiles(Reader):
         """Yields some of the runs of a file, in ascending order; raises a DataError that names it if it is damaged."""
 
     def files(self, path: Path) -> dict[str, tuple[Path, ...]]:
-        """The files of each split; those that nothing divides are `unsplit`."""
-        files = split_files(path, *self.patterns, unsplit=self.unsplit)
+        """The files of each split; those that nothing divides are "all", which `divide` divides, or tests."""
+        files = split_files(path, *self.patterns, unsplit="test" if self.family else "all")
         kept = {
             split: tuple(file for file in inside if is_selected(file, self.selected)) for split, inside in files.items()
         }
@@ -184,13 +179,21 @@ class RunFiles(Reader):
         runs = {split: [run for file in paths for run in self.runs(file)] for split, paths in files.items()}
         facts = self.facts(next(iter(files.values()))[0], options)
         if len(runs.get("all", ())) in (1, 2):  # they may be cut along time
-            runs["all"] = [replace(run, frames=run.frames or self._count(run, facts.metadata)) for run in runs["all"]]
+            for number, run in enumerate(runs["all"]):
+                if not run.frames:
+                    with suppress(DataError):  # raised again where the run is needed
+                        trajectories = self.read(run.file, [run.index], facts.metadata)
+                        frames = sum(len(trajectory.position) for trajectory in trajectories)
+                        runs["all"][number] = replace(run, frames=frames)
+        if self.family:
+            renamed = (
+                f"{inside[0].name} becomes the {split} split."
+                for split, inside in files.items()
+                if len(inside) == 1 and split not in (inside[0].stem, inside[0].parent.name)
+            )
+            family = f"Particle types have the meaning of the {options.family or self.family} family."
+            facts = replace(facts, notes=(family, *facts.notes, *renamed), has_family=True)
         return open_divided(runs, facts, self._read_all, options)
-
-    def _count(self, run: Run, metadata: Metadata) -> int:
-        with suppress(DataError):  # raised again where the run is needed
-            return sum(len(trajectory.position) for trajectory in self.read(run.file, [run.index], metadata))
-        return 0
 
     def _read_all(self, runs: Sequence[Run], metadata: Metadata) -> Iterator[Trajectory]:
         for file, group in groupby(runs, lambda run: run.file):
@@ -200,35 +203,13 @@ class RunFiles(Reader):
                 trajectory = next(trajectories, None)
                 if trajectory is None:
                     raise DataError(f"{file}: its run {run.index} is missing, or empty.")
-                yield run.take(trajectory)
-
-
-class DescribedFiles(RunFiles):
-    """Abstract reader of a format whose files, or files beside them, describe the scene.
-
-    Attributes:
-        family: Meaning of the type ids where the user names no family.
-    """
-
-    fixed_names: ClassVar[bool] = True
-    unsplit: ClassVar[str] = "test"
-    family: ClassVar[str] = "deepmind"
-
-    def open(self, path: Path, options: Options) -> ForeignDataset:
-        dataset = super().open(path, options)
-        renamed = (
-            f"{files[0].name} becomes the {split} split."
-            for split, files in self.files(path).items()
-            if len(files) == 1 and split not in (files[0].stem, files[0].parent.name)
-        )
-        family = f"Particle types have the meaning of the {options.family or self.family} family."
-        return replace(dataset, notes=(family, *dataset.notes, *renamed))
+                yield trajectory if run.part is None else cut(trajectory, run.part)
 
 
 def open_divided(
-    runs: Mapping[str, Sequence[SomeRun]],
+    runs: Mapping[str, Sequence[Run]],
     facts: Facts,
-    read: Callable[[Sequence[SomeRun], Metadata], Iterator[Trajectory]],
+    read: Callable[[Sequence[Run], Metadata], Iterator[Trajectory]],
     options: Options,
 ) -> ForeignDataset:
     """The dataset of runs by split, of which those of the split "all" are divided by `divide`.
@@ -245,7 +226,7 @@ def open_divided(
     splits, divided = divide(undivided) if undivided else (runs, ())
     in_files = replace(metadata, particle_types={**metadata.particle_types, **facts.metadata.particle_types})
 
-    def dataset(splits: Mapping[str, Sequence[SomeRun]], notes: tuple[str, ...]) -> ForeignDataset:
+    def dataset(splits: Mapping[str, Sequence[Run]], notes: tuple[str, ...]) -> ForeignDataset:
         readers = {split: partial(read, each, in_files) for split, each in splits.items()}
         counts = {split: len(each) for split, each in splits.items()}
         return ForeignDataset(metadata, readers, notes, counts, facts.assumed, unknown, facts.steps)
@@ -254,7 +235,7 @@ def open_divided(
     return replace(dataset(splits, (*facts.notes, *divided)), whole=whole)
 
 
-def divide(runs: Sequence[SomeRun]) -> tuple[dict[str, Sequence[SomeRun]], tuple[str, ...]]:
+def divide(runs: Sequence[Run]) -> tuple[dict[str, Sequence[Run]], tuple[str, ...]]:
     """Runs that no folder divides, by split; and notes on how they were divided."""
     named = {split: [run for run in runs if run.split == split] for split in SPLITS}
     if any(named.values()):

@@ -33,7 +33,7 @@ from nmpm.data.statistics import (
     notes_on_rounding,
 )
 from nmpm.data.write import find_writer, write_trajectory
-from nmpm.data.write.base import Clip, TrajectoryWriter
+from nmpm.data.write.base import Clip
 from nmpm.errors import ConfigError, DataError
 
 NOTES = "conversion"
@@ -60,47 +60,36 @@ def write_native(source: ForeignDataset, destination: Path, problems: list[str] 
     destination = Path(destination)
     if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
         raise DataError(f"{destination}: exists already; choose another folder, or delete this one.")
+    names = [name for name in SPLITS if name in source.splits]
+    total, log = sum(source.counts.get(name, 0) for name in names) or None, _Log(source, problems)
     try:
         with new_folder(destination) as folder:
-            return _write(source, folder, problems)
+            with progress_bar("Converting", total) as advance:
+                for name in names:
+                    before = log.number
+                    try:
+                        write_split(folder / f"{name}.h5", log.watch(source.splits[name](), name, advance))
+                    except DataError:
+                        if not problems or log.number > before:
+                            raise
+                    # The statistics are those of the first split, train where there is one.
+                    log.statistics = log.statistics or log.motion.result()
+            if problems and not log.number:
+                raise DataError(problems[0])
+            if log.frames == {1}:
+                raise DataError(f"{names[0]} split: its trajectories have one frame each; motion needs two or more.")
+            if source.unknown:
+                log.find_unknown(Split(folder / f"{names[0]}.h5"))
+            if source.steps and (apart := log.finder.recorded_step):  # frames are by the number of steps
+                for name in names:
+                    with h5py.File(folder / f"{name}.h5", "r+") as file:
+                        for times in (group["time"] for group in file.values() if "time" in group):
+                            times[...] = log.metadata.dt / apart * times[()]
+            metadata, notes = log.final_metadata()
+            write_metadata(folder, replace(metadata, extra=metadata.extra | {NOTES: [*source.notes, *notes]}))
     except OSError as error:
         raise DataError(f"{destination}: cannot be written ({error}).") from error
-
-
-def _write(source: ForeignDataset, folder: Path, problems: list[str] | None) -> tuple[str, ...]:
-    names = [name for name in SPLITS if name in source.splits]
-    total = sum(source.counts.get(name, 0) for name in names) or None
-    log = _Log(source, problems)
-    with progress_bar("Converting", total) as advance:
-        for name in names:
-            before = log.number
-            try:
-                write_split(folder / f"{name}.h5", log.watch(source.splits[name](), name, advance))
-            except DataError:
-                if not problems or log.number > before:
-                    raise
-            # The statistics are those of the first split, train where there is one.
-            log.statistics = log.statistics or log.motion.result()
-    if problems and not log.number:
-        raise DataError(problems[0])
-    if log.frames == {1}:
-        raise DataError(f"{names[0]} split: its trajectories have one frame each; motion needs two or more.")
-    if source.unknown:
-        log.find_unknown(Split(folder / f"{names[0]}.h5"))
-    if source.steps and (factor := log.length_of_step()) != 1:
-        for name in names:
-            _scale_times(folder / f"{name}.h5", factor)
-    metadata, notes = log.final_metadata()
-    write_metadata(folder, replace(metadata, extra=metadata.extra | {NOTES: [*source.notes, *notes]}))
     return (*source.notes, *notes, *log.extent.notes(metadata), *notes_on_rounding(metadata))
-
-
-def _scale_times(path: Path, factor: float) -> None:
-    """Multiplies the recorded times of a split's trajectories."""
-    with h5py.File(path, "r+") as file:
-        for group in file.values():
-            if "time" in group:
-                group["time"][...] = factor * group["time"][()]
 
 
 class _Log:
@@ -120,7 +109,7 @@ class _Log:
         self.extent = Extent(self.metadata.dim)
         dt = None if "dt" in self.unknown else self.metadata.dt
         boundary = None if "boundary" in self.unknown else self.metadata.boundary
-        self._finder = FactFinder(self.metadata.dim, dt, self.metadata.obstacle_types, boundary, source.steps)
+        self.finder = FactFinder(self.metadata.dim, dt, self.metadata.obstacle_types, boundary, source.steps)
         self._facts: list[str] = []
 
     def watch(
@@ -142,7 +131,7 @@ class _Log:
         if position.shape[2] != metadata.dim:
             raise DataError(f"{where}: positions have {position.shape[2]} axes, the metadata has dim = {metadata.dim}.")
         if self.unknown:
-            self._finder.add(trajectory)
+            self.finder.add(trajectory)
             if "gravity" in trajectory.attributes:
                 self.unknown -= {"gravity"}
         if self.problems is None and "particle_types" not in self.unknown:
@@ -161,14 +150,9 @@ class _Log:
         self.frames.add(len(position))
         self.particles = max(self.particles, position.shape[1])
 
-    def length_of_step(self) -> float:
-        """The length of a simulator's step by whose number frames are, where dt is known otherwise; else 1."""
-        apart = self._finder.recorded_step
-        return self.metadata.dt / apart if apart else 1.0
-
     def find_unknown(self, split: Split) -> None:
         """Completes the metadata by facts about the trajectories; `split` is the first one, as written."""
-        facts = self._finder.facts()
+        facts = self.finder.facts()
         self.metadata = facts.complete(self.metadata, self.unknown)
         self._facts = [
             f"{name} {_short(name, getattr(self.metadata, name))} ({how.rstrip('.')})."
@@ -268,6 +252,12 @@ class Exported:
     files: int
     notes: tuple[str, ...]
 
+    @classmethod
+    def of(cls, path: Path, files: int, left_out: set[str]) -> Exported:
+        names = ", ".join(sorted(left_out))
+        note = f"Not numbers of particles, so left out: {names}; .npz and .h5 hold all fields."
+        return cls(path, files, (note,) if left_out else ())
+
 
 @contextmanager
 def open_complete(path: Path, format_name: str | None, options: Options) -> Iterator[ForeignDataset]:
@@ -304,19 +294,15 @@ def export(dataset: ForeignDataset, destination: Path, split: str | None, index:
         split = "test" if "test" in splits else splits[0]
     chosen = splits if split is None else [split]
     counts = {name: dataset.counts[name] for name in chosen}
-    if index is None and sum(counts.values()) != 1:
-        return _export_all(dataset, destination, writer, counts)
-    index, name = index or 0, chosen[0]
-    if index >= counts[name]:
-        raise ConfigError(f"--trajectory {index}: the {name} split has trajectories 0 … {counts[name] - 1}.")
-    trajectory = next(islice(dataset.splits[name](), index, None))
-    return Exported(write_trajectory(destination, trajectory, dataset.metadata), 1, _notes(writer.left_out(trajectory)))
-
-
-def _export_all(
-    dataset: ForeignDataset, destination: Path, writer: TrajectoryWriter, counts: dict[str, int]
-) -> Exported:
-    folder, left_out, total = destination.with_suffix(""), set[str](), sum(counts.values())
+    total = sum(counts.values())
+    if index is not None or total == 1:
+        index, name = index or 0, chosen[0]
+        if index >= counts[name]:
+            raise ConfigError(f"--trajectory {index}: the {name} split has trajectories 0 … {counts[name] - 1}.")
+        trajectory = next(islice(dataset.splits[name](), index, None))
+        file = write_trajectory(destination, trajectory, dataset.metadata)
+        return Exported.of(file, 1, writer.left_out(trajectory))
+    folder, left_out = destination.with_suffix(""), set[str]()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise DataError(
             f"{folder}: exists already; {total} trajectories would become files in it. Choose another name, or one"
@@ -329,10 +315,4 @@ def _export_all(
                 writer.write(new / name / f"{index:05d}{destination.suffix}", Clip(trajectory, dataset.metadata))
                 left_out |= writer.left_out(trajectory)
                 step()
-    return Exported(folder, total, _notes(left_out))
-
-
-def _notes(left_out: set[str]) -> tuple[str, ...]:
-    if not left_out:
-        return ()
-    return (f"Not numbers of particles, so left out: {', '.join(sorted(left_out))}; .npz and .h5 hold all fields.",)
+    return Exported.of(folder, total, left_out)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nmpm._support.bounded_files import check_regular
-from nmpm.data.convert.base import DescribedFiles, Facts, Options, Run, located
+from nmpm.data.convert.base import Facts, Options, Run, RunFiles, located
 from nmpm.data.format import METADATA_FILE, Metadata, Trajectory, read_metadata
 from nmpm.errors import DataError
 
@@ -141,19 +141,18 @@ def _feature(message: bytes) -> Feature:
             return [_bytes(value) for value in values]
         if kind == _FLOATS:
             return np.frombuffer(b"".join(map(_bytes, values)), "<f4")
-        if kind == _INTEGERS:
-            return np.array([number for value in values for number in _integers(value)], np.uint64).astype(np.int64)
+        if kind == _INTEGERS:  # of 64 bits in two's complement, one by one or packed into bytes
+            numbers = list[int]()
+            for value in values:
+                if isinstance(value, int):
+                    numbers.append(value)
+                    continue
+                position = 0
+                while position < len(value):
+                    number, position = _varint(value, position)
+                    numbers.append(number)
+            return np.array(numbers, np.uint64).astype(np.int64)
     return []
-
-
-def _integers(value: int | bytes) -> Iterator[int]:
-    """Yields one integer, or several packed into bytes; 64 bits in two's complement."""
-    position = 0
-    while isinstance(value, bytes) and position < len(value):
-        number, position = _varint(value, position)
-        yield number
-    if isinstance(value, int):
-        yield value
 
 
 def _fields(message: bytes) -> Iterator[tuple[int, int | bytes]]:
@@ -197,14 +196,16 @@ def _bytes(value: int | bytes) -> bytes:
     return value
 
 
-class DeepMind(DescribedFiles):
+class DeepMind(RunFiles):
     """TFRecord files with a `metadata.json` beside them."""
 
     summary: ClassVar[str] = "DeepMind's TFRecord files with metadata.json (Learning to Simulate)"
     patterns: tuple[str, ...] = ("*.tfrecord",)
+    fixed_names: ClassVar[bool] = True
+    family: ClassVar[str] = "deepmind"
 
     def facts(self, file: Path, options: Options) -> Facts:
-        return Facts(read_metadata(file.parent, options.family or self.family), has_family=True)
+        return Facts(read_metadata(file.parent, options.family or self.family))
 
     def runs(self, file: Path) -> Sequence[Run]:
         return [Run(file, index) for index in range(len(record_offsets(file)))]
@@ -219,9 +220,10 @@ def _trajectory(example: SequenceExample, dim: int, where: str) -> Trajectory:
     if "position" not in example.steps or "particle_type" not in example.context:
         features = ", ".join(sorted({*example.context, *example.steps})) or "nothing"
         raise DataError(f"{where}: needs the features `particle_type` and `position`; found {features}.")
-    particle_type = _numbers(example.context["particle_type"], np.dtype("<i8"), f"{where}, particle_type")
+    context, steps = dict(example.context), dict(example.steps)
+    particle_type = _numbers(context.pop("particle_type"), np.dtype("<i8"), f"{where}, particle_type")
     particles = len(particle_type)
-    frames = [_numbers(step, np.dtype("<f4"), f"{where}, position") for step in example.steps["position"]]
+    frames = [_numbers(step, np.dtype("<f4"), f"{where}, position") for step in steps.pop("position")]
     wrong = [i for i, frame in enumerate(frames) if len(frame) != particles * dim]
     if wrong or not frames or not particles:
         got = f"; frame {wrong[0]} has {len(frames[wrong[0]])}" if wrong else ""
@@ -229,15 +231,21 @@ def _trajectory(example: SequenceExample, dim: int, where: str) -> Trajectory:
             f"{where}: {len(frames)} frames, {particles} particles: each frame needs {particles} x {dim} numbers{got}."
             f" Is `dim` of {METADATA_FILE} right?"
         )
-    attributes = {k: _attribute(v) for k, v in example.context.items() if k != "particle_type" and len(v)}
-    fields = {
-        name: _field(steps, particles, dim, f"{where}, {name}")
-        for name, steps in example.steps.items()
-        if name != "position"
-    }
+    attributes, fields = dict[str, object](), dict[str, np.ndarray]()
+    for name, feature in context.items():
+        if isinstance(feature, np.ndarray) and len(feature):
+            attributes[name] = feature.item() if feature.size == 1 else feature
+        elif feature:
+            attributes[name] = np.bytes_(feature[0]) if len(feature) == 1 else np.array(feature)
+    for name, series in steps.items():
+        rows = [_numbers(step, np.dtype("<f4"), f"{where}, {name}") for step in series]
+        if len(lengths := {len(row) for row in rows}) > 1:
+            numbers = f"{min(lengths)} to {max(lengths)} numbers"
+            raise DataError(f"{where}, {name}: frames have {numbers}; all need equally many.")
+        values = np.stack(rows) if rows else np.empty((0, 0), np.float32)
+        fields[name] = values.reshape(len(rows), particles, dim) if values.shape[1] == particles * dim else values
     with located(where):
-        position = np.stack(frames).reshape(len(frames), particles, dim)
-        return Trajectory(position, particle_type, attributes, fields)
+        return Trajectory(np.stack(frames).reshape(len(frames), particles, dim), particle_type, attributes, fields)
 
 
 def _numbers(feature: Feature, kind: np.dtype[Any], where: str) -> np.ndarray:
@@ -250,20 +258,3 @@ def _numbers(feature: Feature, kind: np.dtype[Any], where: str) -> np.ndarray:
             f"{where}: expected one string of {kind.itemsize}-byte numbers; found strings of {sizes} bytes."
         )
     return np.frombuffer(feature[0], kind)
-
-
-def _attribute(feature: Feature) -> object:
-    if isinstance(feature, np.ndarray):
-        return feature.item() if feature.size == 1 else feature
-    return np.bytes_(feature[0]) if len(feature) == 1 else np.array(feature)
-
-
-def _field(steps: list[Feature], particles: int, dim: int, where: str) -> np.ndarray:
-    """(T, k) numbers per frame; (T, N, D) where k is N·D."""
-    rows = [_numbers(step, np.dtype("<f4"), where) for step in steps]
-    if len({len(row) for row in rows}) > 1:
-        raise DataError(
-            f"{where}: frames have {min(map(len, rows))} to {max(map(len, rows))} numbers; all need equally many."
-        )
-    values = np.stack(rows) if rows else np.empty((0, 0), np.float32)
-    return values.reshape(len(values), particles, dim) if values.shape[1] == particles * dim else values

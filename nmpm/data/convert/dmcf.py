@@ -18,7 +18,7 @@ import numpy as np
 from nmpm._support.bounded_files import EXPANSION, check_regular, expansion_limit
 from nmpm._support.machine import check_fits
 from nmpm._support.messages import install, one_line
-from nmpm.data.convert.base import UNKNOWN_LENGTH, DescribedFiles, Facts, Options, located, readable
+from nmpm.data.convert.base import UNKNOWN_LENGTH, Facts, Options, RunFiles, located, readable
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.stated import find_family
 from nmpm.data.statistics import extent_of
@@ -31,11 +31,12 @@ _ITEMS = 256  # of a list or map
 _KIND = re.compile(rb"[<>|=]?[biuf]\d{1,2}")
 
 
-class Dmcf(DescribedFiles):
+class Dmcf(RunFiles):
     """A file per trajectory; particle type 0 is the fluid, type 1 the solid boundary."""
 
     summary: ClassVar[str] = "DMCF's *.msgpack.zst files (extra convert)"
     patterns: tuple[str, ...] = ("*.msgpack.zst",)
+    fixed_names: ClassVar[bool] = True
     family: ClassVar[str] = "lagrangebench"
 
     def facts(self, file: Path, options: Options) -> Facts:
@@ -57,13 +58,36 @@ class Dmcf(DescribedFiles):
             *(() if options.dt else (f"The files do not state dt; {_DT:g} s is assumed (--dt).",)),
             *(() if options.gravity else (f"The files do not state gravity; {_GRAVITY:g} along y is assumed.",)),
         )
-        return Facts(metadata, notes=notes, assumed=frozenset({"dt", "gravity"}), has_family=True)
+        return Facts(metadata, notes=notes, assumed=frozenset({"dt", "gravity"}))
 
     def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:  # noqa: ARG002
         frames = list(_frames(file))
         if not frames:
             raise DataError(f"{file}: the file has no frame.")
-        yield _trajectory(frames, file)
+        positions, first = [_array(frame, "pos", f"{file}, frame {i}") for i, frame in enumerate(frames)], frames[0]
+        changed = [index for index, position in enumerate(positions) if position.shape != positions[0].shape]
+        if changed:
+            raise DataError(
+                f"{file}, frame {changed[0]}: {positions[changed[0]].shape[0]} particles, but {positions[0].shape[0]}"
+                " in frame 0. A trajectory has a fixed number of particles; cut it where the number changes."
+            )
+        fluid = np.stack(positions)
+        wall = _wall(first, fluid.shape[2], file)
+        check_fits(len(fluid), len(wall), fluid.shape[2], str(file))
+        kinds = np.repeat([_FLUID, _WALL], [fluid.shape[1], len(wall)]).astype(np.int64)
+        still = np.broadcast_to(wall, (len(fluid), *wall.shape))
+        attributes: dict[str, Any] = {key: np.bytes_(value) for key, value in first.items() if isinstance(value, bytes)}
+        gravity = first.get("grav")
+        if isinstance(gravity, np.ndarray) and gravity.shape == (fluid.shape[2],):
+            attributes["gravity"] = gravity.astype(np.float64)
+        fields = {}  # (T, …) where all frames have one of equal shape, else that of the first frame
+        for key, value in first.items():
+            if key not in ("pos", "box") and isinstance(value, np.ndarray):
+                values: list[Any] = [frame.get(key) for frame in frames]
+                same = all(isinstance(item, np.ndarray) and item.shape == value.shape for item in values)
+                fields[key] = np.stack(values) if same else value
+        with located(file):
+            yield Trajectory(np.concatenate([fluid, still], axis=1).astype(np.float32), kinds, attributes, fields)
 
 
 def _frames(path: Path) -> Iterator[dict[str, Any]]:
@@ -83,15 +107,12 @@ def _frames(path: Path) -> Iterator[dict[str, Any]]:
             stream, raw=True, max_buffer_size=_FRAME_BYTES, max_array_len=_ITEMS, max_map_len=_ITEMS
         )
         for index in range(reader.read_array_header()):
-            yield _decode_frame(reader.unpack(), f"{path}, frame {index}")
+            frame, where = reader.unpack(), f"{path}, frame {index}"
+            if not isinstance(frame, dict) or not all(isinstance(key, bytes) for key in frame):
+                raise DataError(f"{where}: expected a map with names, found {type(frame).__name__}.")
+            yield {key.decode("utf-8", "replace"): _value(value, f"{where}, {key!r}") for key, value in frame.items()}
             if reader.tell() > expansion_limit(path.stat().st_size):
                 raise ValueError(f"it unpacks to more than {EXPANSION} times its size")
-
-
-def _decode_frame(frame: Any, where: str) -> dict[str, Any]:
-    if not isinstance(frame, dict) or not all(isinstance(key, bytes) for key in frame):
-        raise DataError(f"{where}: expected a map with names, found {type(frame).__name__}.")
-    return {key.decode("utf-8", "replace"): _value(value, f"{where}, {key!r}") for key, value in frame.items()}
 
 
 def _value(value: Any, where: str) -> Any:
@@ -124,37 +145,3 @@ def _wall(first: dict[str, Any], dim: int, path: Path) -> np.ndarray:
     if wall.shape[1] != dim:
         raise DataError(f"{path}: 'box' has {wall.shape[1]} axes, 'pos' has {dim}.")
     return wall
-
-
-def _trajectory(frames: list[dict[str, Any]], path: Path) -> Trajectory:
-    positions = [_array(frame, "pos", f"{path}, frame {index}") for index, frame in enumerate(frames)]
-    changed = [index for index, position in enumerate(positions) if position.shape != positions[0].shape]
-    if changed:
-        raise DataError(
-            f"{path}, frame {changed[0]}: {positions[changed[0]].shape[0]} particles, but {positions[0].shape[0]}"
-            " in frame 0. A trajectory has a fixed number of particles; cut it where the number changes."
-        )
-    fluid, first = np.stack(positions), frames[0]
-    wall = _wall(first, fluid.shape[2], path)
-    check_fits(len(fluid), len(wall), fluid.shape[2], str(path))
-    kinds = np.repeat([_FLUID, _WALL], [fluid.shape[1], len(wall)]).astype(np.int64)
-    still = np.broadcast_to(wall, (len(fluid), *wall.shape))
-    attributes: dict[str, Any] = {key: np.bytes_(value) for key, value in first.items() if isinstance(value, bytes)}
-    gravity = first.get("grav")
-    if isinstance(gravity, np.ndarray) and gravity.shape == (fluid.shape[2],):
-        attributes["gravity"] = gravity.astype(np.float64)
-    with located(path):
-        position = np.concatenate([fluid, still], axis=1).astype(np.float32)
-        return Trajectory(position, kinds, attributes, _fields(frames))
-
-
-def _fields(frames: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """Arrays beside the positions: (T, …) where all frames have one of equal shape, else that of the first frame."""
-    fields = {}
-    for key, value in frames[0].items():
-        if key in ("pos", "box") or not isinstance(value, np.ndarray):
-            continue
-        values = [frame.get(key) for frame in frames]
-        same = all(isinstance(item, np.ndarray) and item.shape == value.shape for item in values)
-        fields[key] = np.stack(values) if same else value  # type: ignore[arg-type]  # (`same`: all arrays)
-    return fields

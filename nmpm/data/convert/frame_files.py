@@ -45,6 +45,7 @@ from nmpm.data.convert.base import (
     placeholder_metadata,
 )
 from nmpm.data.convert.frames import Frame, FrameArrays, FrameLayout, FrameStack, flat_axes, join_frames
+from nmpm.data.convert.named_arrays import plane_notes
 from nmpm.data.format import SPLITS, Metadata, Trajectory, is_no_data
 from nmpm.errors import DataError
 
@@ -95,13 +96,21 @@ def choose_particles(folder: Path, kinds: Kinds, problem: Callable[[Path], str])
     problems = {kind: problem(files[0]) for kind, files in kinds.items()}
     walls = [kind for kind in kinds if words(kind) & _WALL_WORDS and not problems[kind]]
     points = [kind for kind in kinds if kind not in walls and not problems[kind]]
-    particles = [kind for kind in points if not words(kind) & _OTHER_WORDS] or points
+    particles = [kind for kind in points if not has_other_word(kind)] or points
     series = [kind for kind in particles if len(kinds[kind]) > 1]
     particles = series if len(particles) > 1 and series else particles
     if not particles and len(walls) == 1:
         particles, walls = walls, []
-    if len(particles) != 1:
-        raise DataError(f"{folder}: {_which(kinds, particles, problems)}")
+    if not particles:
+        shown = ", ".join(f"{kind} ({problems[kind]})" for kind in list(kinds)[:4])
+        raise DataError(f"{folder}: no file in it has particles: {shown}.")
+    if len(particles) > 1:
+        shown = ", ".join(f"{kind} ({len(kinds[kind])})" for kind in particles[:6])
+        raise DataError(
+            f"{folder}: files of {len(particles)} kinds may be the particles: {shown}. State which: --files"
+            f" '{particles[0]}'; kinds that you list, as in --files '{','.join(particles[:2])}', join as materials."
+            " (nmpm fit: --data.files.) If each kind is a run, give it a folder of its own."
+        )
     names = {particles[0]: "", **dict.fromkeys(walls, WALL)}
     others = [f"{kind} ({problems[kind] or 'another kind of file'})" for kind in kinds if kind not in names]
     joined = f" with the boundary particles of {', '.join(walls)}" if walls else ""
@@ -110,27 +119,12 @@ def choose_particles(folder: Path, kinds: Kinds, problem: Callable[[Path], str])
     return {kind: kinds[kind] for kind in names}, note
 
 
-def keep_particles(folder: Path, kinds: Kinds) -> tuple[Kinds, str]:
-    """The lists of frames but for those that are called as walls, surfaces and the like are, and a note on these."""
-    particles = {kind: files for kind, files in kinds.items() if not _only_others(kind)}
-    others = ", ".join(kind for kind in kinds if kind not in particles)
-    if not particles or not others:
-        return kinds, ""
-    return particles, f"{folder}: left out by their names: {others}; --files PATTERN reads them."
-
-
-def other_folders(path: Path, folders: Mapping[Path, Sequence[Path]]) -> list[Path]:
-    """Folders that are called as those of grids and surfaces are, with files whose names no other folder has."""
-    others = [folder for folder in folders if folder != path and _only_others(folder.name)]
-    kinds = {kind for folder, files in folders.items() if folder not in others for kind in by_kind(files)}
-    return [folder for folder in others if kinds and not kinds & by_kind(folders[folder]).keys()]
-
-
-def _only_others(name: str) -> bool:
+def has_only_other_words(name: str) -> bool:
+    """Whether a name is one of grids, surfaces, walls and the like, and of nothing else."""
     return bool(words(name)) and words(name) <= _OTHER_WORDS | _WALL_WORDS | {"bodies"}
 
 
-def is_other_name(name: str) -> bool:
+def has_other_word(name: str) -> bool:
     """Whether a word of a name is one of grids, surfaces and the like."""
     return bool(words(name) & _OTHER_WORDS)
 
@@ -155,35 +149,18 @@ def _words(text: str) -> list[str]:
     return re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", text)
 
 
-def _which(kinds: Kinds, particles: Sequence[str], problems: Mapping[str, str]) -> str:
-    shown = ", ".join(f"{kind} ({len(kinds[kind])})" for kind in list(particles or kinds)[:6])
-    if not particles:
-        return f"no file in it has particles: {', '.join(f'{kind} ({problems[kind]})' for kind in list(kinds)[:4])}."
-    first, *_ = particles
-    return (
-        f"files of {len(particles)} kinds may be the particles: {shown}. State which: --files '{first}'; kinds that"
-        f" you list, as in --files '{','.join(particles[:2])}', join as materials. (nmpm fit: --data.files.) If each"
-        " kind is a run, give it a folder of its own."
-    )
-
-
 _DEPTH = 3  # of folders
 _FIRST_FRAMES = 10  # of a file with many, from which the layout is taken
 _MISSING = 0.1  # part of a run's frames that may be missing
 
 
 @dataclass(frozen=True)
-class FrameRun(Run):
-    """A run in a file with many frames, or in a file per frame (None where one is missing)."""
+class FrameFiles:
+    """The files of a run: one with many frames, or a file per frame."""
 
-    files: tuple[Path | None, ...] = ()
+    files: tuple[Path | None, ...]  # None where one is missing
     material: str = ""  # of the particles, where files of further materials belong to these
     beside: Mapping[Path, Sequence[tuple[str, Path]]] = field(default_factory=dict)  # these, with their materials
-
-    @property
-    def present(self) -> tuple[Path, ...]:
-        """The files that are there."""
-        return tuple(file for file in self.files if file is not None)
 
 
 class FrameFormat(Reader):
@@ -221,10 +198,19 @@ class FrameFormat(Reader):
         }
         names = {number: name for name, number in type_ids.items()}
         metadata = placeholder_metadata(len(layout.axes), particle_types=names, **facts)
-        notes = (*layout.notes(), *gaps, *self.notes(first, options))
+        notes = [*plane_notes(layout.constant)]
+        if layout.id_name:
+            notes.append(f"Particles are matched by the array {layout.id_name!r}.")
+        if layout.left_out:
+            notes.append(f"Left out, as they are not numbers of all particles: {', '.join(layout.left_out)}.")
+        notes += [*gaps, *self.notes(first, options)]
         steps = first[0].time is None and first[0].step is not None
-        stated_facts = Facts(metadata, EVERYTHING_UNKNOWN - set(facts), notes, steps=steps)
+        stated_facts = Facts(metadata, EVERYTHING_UNKNOWN - set(facts), tuple(notes), steps=steps)
         return open_divided({"all": runs}, stated_facts, partial(self._read_all, layout=layout), options)
+
+    def first_files(self, path: Path) -> list[Path]:
+        """The files of this format in the first folder that has any."""
+        return next(self._folders(path), (path, []))[1]
 
     def _folders(self, path: Path) -> Iterator[tuple[Path, list[Path]]]:
         """Yields folders with files of this format and these files; of a file its own."""
@@ -249,51 +235,47 @@ class FrameFormat(Reader):
         by_content = self.signature and self.patterns == ANY_NAME
         return [file for file in files if starts_with(file, self.signature)] if by_content else files
 
-    def _runs(self, path: Path) -> tuple[list[FrameRun], list[str]]:
-        """The runs in order, and notes on missing frames."""
-        folders = list(self._folders(path))
+    def _runs(self, path: Path) -> tuple[list[Run], list[str]]:
+        """The runs in order, and notes on missing frames and on what is left out."""
+        folders = dict(self._folders(path))
         if not folders:
             raise DataError(f"{path}: no file {' or '.join(self.selected or self.patterns)} there.")
-        others = [] if self.selected else other_folders(path, dict(folders))
-        folders = [(folder, files) for folder, files in folders if folder not in others]
-        many = self._has_many(folders[0][1])
+        others = [] if self.selected else _other_folders(path, folders)
+        folders = {folder: files for folder, files in folders.items() if folder not in others}
+        # Whether files have many frames each, as the first one with particles tells.
+        firsts = [kind[0] for kind in by_kind(next(iter(folders.values()))).values()]
+        readable = firsts if len(firsts) == 1 else (file for file in firsts if not self._problem(file))
+        many = any(len(list(islice(self.frames(file), 2))) > 1 for file in islice(readable, 1))
         if path.is_file() and not many:
             raise DataError(f"{path}: there is one frame in it. Give the folder of the frames.")
-        runs: list[FrameRun] = []
-        gaps, choices = list[str](), list[str]()
-        for folder, files in folders:
-            kinds, choice = self._choose(folder, files, many)
-            choices += [choice] if choice else []
+        runs, gaps, choices = list[Run](), list[str](), list[str]()
+        for folder, files in folders.items():
+            kinds: Kinds = by_kind(files)
+            if len(kinds) > 1 and not self.selected:
+                particles = [kind for kind in kinds if not has_only_other_words(kind)]
+                if not many:
+                    kinds, choice = choose_particles(folder, kinds, self._problem)
+                    choices.append(choice)
+                elif 0 < len(particles) < len(kinds) and any(files[0].match(pattern) for pattern in self.listings):
+                    left_out = ", ".join(kind for kind in kinds if kind not in particles)
+                    choices.append(f"{folder}: left out by their names: {left_out}; --files PATTERN reads them.")
+                    kinds = {kind: kinds[kind] for kind in particles}
             if many:
-                runs += [
-                    FrameRun(file, 0, split=_split_of(file, path), files=(file,))
-                    for each in kinds.values()
-                    for file in each
-                ]
+                each = (file for inside in kinds.values() for file in inside)
+                runs += [Run(file, 0, split=_split_of(file, path), source=FrameFiles((file,))) for file in each]
             else:
                 runs.append(_run_of(kinds, folder, _split_of(folder, path), gaps))
         if many and len(runs) < 3:
             runs = [replace(run, frames=self.count(run.file)) for run in runs]
-        left_out = (
-            f"{others[0]}: left out by its name, with {counted(len(others) - 1, 'more folder')}." if others else ""
-        )
-        return runs, [*filter(None, (_first_of(gaps), _first_of(choices), left_out))]
-
-    def _has_many(self, files: Sequence[Path]) -> bool:
-        """Whether the files have many frames each, as the first one with particles tells."""
-        firsts = [kind[0] for kind in by_kind(files).values()]
-        readable = firsts[:1] if len(firsts) == 1 else [file for file in firsts if not self._problem(file)]
-        return any(len(list(islice(self.frames(file), 2))) > 1 for file in readable[:1])
-
-    def _choose(self, folder: Path, files: Sequence[Path], many: bool) -> tuple[Kinds, str]:
-        """The files of particles among those of a folder, by their names, and a note on the others."""
-        kinds = by_kind(files)
-        if len(kinds) == 1 or self.selected:
-            return kinds, ""
-        if not many:
-            return choose_particles(folder, kinds, self._problem)
-        lists = any(fnmatch.fnmatch(files[0].name, pattern) for pattern in self.listings)
-        return keep_particles(folder, kinds) if lists else (kinds, "")
+        notes = [
+            f"{each[0]} The same in {counted(len(each) - 1, 'more run')}." if each[1:] else each[0]
+            for each in (gaps, choices)
+            if each
+        ]
+        if others:
+            more = counted(len(others) - 1, "more folder")
+            notes.append(f"{others[0]}: left out by its name, with {more}.")
+        return runs, notes
 
     def _problem(self, file: Path) -> str:
         """Why a file has no particles; empty if it has."""
@@ -303,11 +285,11 @@ class FrameFormat(Reader):
             return str(error).removeprefix(f"{file}: ").rstrip(".")
         return "no frame" if frame is None else "a surface" if frame.surface else ""
 
-    def _first_frames(self, run: FrameRun) -> list[Frame]:
+    def _first_frames(self, run: Run) -> list[Frame]:
         """A few frames of a run with particles: the first of a file with many, else those of a few files."""
-        files = run.present
+        files = [file for file in run.source.files if file is not None]
         if len(files) > 1:
-            frames = [self._only_frame(file, run) for file in (*files[:2], files[-1])]
+            frames = [self._only_frame(file, run.source) for file in (*files[:2], files[-1])]
         else:
             frames = []
             for frame in islice(self.frames(files[0]), _FIRST_FRAMES):
@@ -319,7 +301,7 @@ class FrameFormat(Reader):
             raise DataError(f"{run.file}: there are no particles in its first frames.")
         return inhabited
 
-    def _type_ids(self, first: Sequence[Frame], runs: Sequence[FrameRun]) -> dict[str, int]:
+    def _type_ids(self, first: Sequence[Frame], runs: Sequence[Run]) -> dict[str, int]:
         """Type ids by the names in the first frame of all runs, where types have names; those of the files, or new."""
 
         def ids(frame: Frame) -> dict[str, int]:
@@ -329,14 +311,13 @@ class FrameFormat(Reader):
 
         named = ids(first[0])
         if named:
-            firsts = (frame for run in runs for frame, _ in islice(self._frames_of(replace(run, files=run.present)), 1))
-            frames = [*filter(None, firsts), *first]
-            named = {name: number for frame in frames for name, number in ids(frame).items()}
+            frames = [frame for run in runs for frame, _ in islice(self._frames_of(run), 1) if frame is not None]
+            named = {name: number for frame in (*frames, *first) for name, number in ids(frame).items()}
         if set(named.values()) == {-1}:
             return {name: number for number, name in enumerate(sorted(named))}
         return named if len(set(named.values())) == len(named) else {}
 
-    def _read_all(self, runs: Sequence[FrameRun], metadata: Metadata, layout: FrameLayout) -> Iterator[Trajectory]:
+    def _read_all(self, runs: Sequence[Run], metadata: Metadata, layout: FrameLayout) -> Iterator[Trajectory]:
         ids = {name: number for number, name in metadata.particle_types.items()}
         for run in runs:
             total = (run.frames if run.part is None else len(run.part)) or None
@@ -347,21 +328,21 @@ class FrameFormat(Reader):
                     advance()
             yield stack.trajectory(str(run.file))
 
-    def _frames_of(self, run: FrameRun) -> Iterator[tuple[Frame | None, str]]:
+    def _frames_of(self, run: Run) -> Iterator[tuple[Frame | None, str]]:
         """Yields the frames to take, None where one is missing, and where they are."""
         part = slice(None) if run.part is None else slice(run.part.start, run.part.stop)
-        if len(run.files) == 1:
-            for number, frame in islice(enumerate(self.frames(run.present[0])), part.start, part.stop):
+        if len(run.source.files) == 1:
+            for number, frame in islice(enumerate(self.frames(run.source.files[0])), part.start, part.stop):
                 yield frame, f"{run.file}, frame {number}"
             return
-        for file in run.files[part]:
-            yield (None, "") if file is None else (self._only_frame(file, run), str(file))
+        for file in run.source.files[part]:
+            yield (None, "") if file is None else (self._only_frame(file, run.source), str(file))
 
-    def _only_frame(self, file: Path, run: FrameRun) -> Frame:
+    def _only_frame(self, file: Path, source: FrameFiles) -> Frame:
         try:
             frames = list(islice(self.frames(file), 2))
         except DataError as error:
-            if file != run.files[-1]:
+            if file != source.files[-1]:
                 raise
             raise DataError(
                 f"{error} It is the last file of its run: if it is still being written, leave it out."
@@ -369,11 +350,18 @@ class FrameFormat(Reader):
         if len(frames) != 1:
             number = "more than one frame" if frames else "no frame"
             raise DataError(f"{file}: there is {number} in it, but one in the first file.")
-        beside = [(name, next(self.frames(other))) for name, other in run.beside.get(file, ())]
-        return join_frames([(run.material, frames[0]), *beside]) if beside else frames[0]
+        beside = [(name, next(self.frames(other))) for name, other in source.beside.get(file, ())]
+        return join_frames([(source.material, frames[0]), *beside]) if beside else frames[0]
 
 
-def _run_of(kinds: Kinds, folder: Path, split: str | None, gaps: list[str]) -> FrameRun:
+def _other_folders(path: Path, folders: Mapping[Path, Sequence[Path]]) -> list[Path]:
+    """Folders that are called as those of grids and surfaces are, with files whose names no other folder has."""
+    others = [folder for folder in folders if folder != path and has_only_other_words(folder.name)]
+    kinds = {kind for folder, files in folders.items() if folder not in others for kind in by_kind(files)}
+    return [folder for folder in others if kinds and not kinds & by_kind(folders[folder]).keys()]
+
+
+def _run_of(kinds: Kinds, folder: Path, split: str | None, gaps: list[str]) -> Run:
     """The run in a folder whose particles are in files of these kinds; those of the first tell the frames."""
     names, (first, *others) = material_names(kinds), kinds
     series = _series(folder, kinds[first], gaps)
@@ -385,12 +373,7 @@ def _run_of(kinds: Kinds, folder: Path, split: str | None, gaps: list[str]) -> F
         ]
         for file in kinds[first]
     }
-    return FrameRun(folder, 0, len(series), split, files=series, material=names[first], beside=beside)
-
-
-def _first_of(notes: Sequence[str]) -> str:
-    """The first note, and the number of others like it."""
-    return f"{notes[0]} The same in {counted(len(notes) - 1, 'more run')}." if notes[1:] else "".join(notes)
+    return Run(folder, 0, len(series), split, source=FrameFiles(series, names[first], beside))
 
 
 def _number(file: Path) -> int:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
@@ -19,7 +18,6 @@ from nmpm.data.convert.named_arrays import (
     component_names,
     constant_axis,
     plain_name,
-    plane_notes,
     type_ids,
     with_meaning,
 )
@@ -57,10 +55,14 @@ def join_frames(parts: Sequence[tuple[str, Frame]]) -> Frame:
 
     Ids of the first part stay; those of the others, which may be the same numbers, are counted from `ID_STRIDE` on.
     """
-    first = parts[0][1]
-    names = [
-        name for name in first.arrays if all(_fits(first.arrays[name], frame.arrays.get(name)) for _, frame in parts)
-    ]
+    first, counts = parts[0][1], [len(frame.position) for _, frame in parts]
+
+    def fits(name: str, values: np.ndarray | None) -> bool:
+        like = first.arrays[name]
+        texts = like.dtype.kind == "U"
+        return values is not None and values.shape[1:] == like.shape[1:] and (values.dtype.kind == "U") == texts
+
+    names = [name for name in first.arrays if all(fits(name, frame.arrays.get(name)) for _, frame in parts)]
     types = with_meaning("types", names)
     arrays = {
         f"{name}_in_file" if name in types else name: np.concatenate([frame.arrays[name] for _, frame in parts])
@@ -68,29 +70,14 @@ def join_frames(parts: Sequence[tuple[str, Frame]]) -> Frame:
     }
     for name in with_meaning("id", arrays):
         if arrays[name].dtype.kind in "iuf":
-            starts = np.repeat(np.arange(len(parts)) * ID_STRIDE, [len(frame.position) for _, frame in parts])
-            arrays[name] = arrays[name].astype(np.int64) + starts
+            arrays[name] = arrays[name].astype(np.int64) + np.repeat(np.arange(len(parts)) * ID_STRIDE, counts)
+    left_out = [name for _, frame in parts for name in frame.left_out]
+    left_out += [name for _, frame in parts for name in frame.arrays if name not in names]
     return replace(
         first,
         position=np.concatenate([frame.position for _, frame in parts]),
-        arrays=arrays
-        | {"material": np.repeat([name for name, _ in parts], [len(frame.position) for _, frame in parts])},
-        left_out=tuple(
-            dict.fromkeys(
-                [
-                    *(name for _, frame in parts for name in frame.left_out),
-                    *(name for _, frame in parts for name in frame.arrays if name not in names),
-                ]
-            )
-        ),
-    )
-
-
-def _fits(values: np.ndarray, other: np.ndarray | None) -> bool:
-    return (
-        other is not None
-        and other.shape[1:] == values.shape[1:]
-        and (other.dtype.kind == "U") == (values.dtype.kind == "U")
+        arrays=arrays | {"material": np.repeat([name for name, _ in parts], counts)},
+        left_out=tuple(dict.fromkeys(left_out)),
     )
 
 
@@ -119,13 +106,6 @@ class FrameLayout:
         id_name = next(unique, None)
         texts = FrameArrays.of(first, axes, id_name).texts
         return cls(axes, constant, id_name, (*first.left_out, *texts))
-
-    def notes(self) -> tuple[str, ...]:
-        """For the user."""
-        notes = [*plane_notes(self.constant)]
-        notes += [f"Particles are matched by the array {self.id_name!r}."] if self.id_name else []
-        left_out = ", ".join(self.left_out)
-        return (*notes, *([f"Left out, as they are not numbers of all particles: {left_out}."] if left_out else []))
 
 
 def wrap(position: np.ndarray, box: Sequence[Interval] | None, boundary: Sequence[Boundary] | None) -> np.ndarray:
@@ -160,32 +140,45 @@ class FrameArrays:
             axes: The axes of the positions that are kept; a velocity has them, too.
             id_name: The array of ids; None if there is none.
         """
-        single = {n: v[:, 0] if v.ndim == 2 and v.shape[1] == 1 else v for n, v in frame.arrays.items()}
-        left = {name: values for name, values in single.items() if not _is_position(name, values)}
+        left: dict[str, np.ndarray] = {}
+        for name, values in frame.arrays.items():
+            values = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+            if plain_name(name) not in (AXES if values.ndim == 1 else USUAL_NAMES["position"]):
+                left[name] = values
         identity = _integers(left.pop(id_name)) if id_name in left else None
-        present = _take(left, "active", _logicals)
-        types, type_names = _take(left, "types", _integers), _take(left, "types", _strings)
-        velocity = _take(left, "velocity", partial(_vectors, axes=axes))
-        velocity = _take_components(left, axes) if velocity is None else velocity
-        scalars = {name: scalar for key, values in left.items() for name, scalar in _scalars(key, values)}
+
+        def take(meaning: str, convert: Callable[[np.ndarray], np.ndarray | None]) -> np.ndarray | None:
+            """Removes the first array whose name has a meaning and that fits, and returns it, or else None."""
+            for name in with_meaning(meaning, left):
+                if (values := convert(left[name])) is not None:
+                    del left[name]
+                    return values
+            return None
+
+        def vectors(values: np.ndarray) -> np.ndarray | None:
+            fits = values.ndim == 2 and max(axes) < values.shape[1] <= len(AXES) and values.dtype.kind in "iuf"
+            return values[:, axes] if fits else None
+
+        def strings(values: np.ndarray) -> np.ndarray | None:
+            return values.astype(str) if values.ndim == 1 and values.dtype.kind in "SU" else None
+
+        present, types, type_names = take("active", _logicals), take("types", _integers), take("types", strings)
+        if (velocity := take("velocity", vectors)) is None:  # or an array per axis
+            flat = [name for name, values in left.items() if values.ndim == 1 and values.dtype.kind in "iuf"]
+            names = component_names(by_plain_name(flat), "velocity")
+            if len(names) > max(axes):
+                columns = [left.pop(name) for name in names]
+                velocity = np.stack([columns[axis] for axis in axes], axis=1)
+        scalars = dict[str, np.ndarray]()
+        for key, values in left.items():
+            name = "particle_time" if key == "time" else key.replace("/", "_")
+            if values.dtype.kind in "biuf" and values.ndim == 1:
+                scalars[name] = values
+            elif values.dtype.kind in "biuf":
+                ends = AXES if values.shape[1] <= len(AXES) else range(values.shape[1])
+                scalars |= {f"{name}_{end}": column for end, column in zip(ends, values.T, strict=False)}
         texts = tuple(name for name, values in left.items() if values.dtype.kind not in "biuf")
         return cls(identity, types, type_names, None if present is None else present != 0, velocity, scalars, texts)
-
-
-def _is_position(name: str, values: np.ndarray) -> bool:
-    return plain_name(name) in (AXES if values.ndim == 1 else USUAL_NAMES["position"])
-
-
-def _take(
-    arrays: dict[str, np.ndarray], meaning: str, convert: Callable[[np.ndarray], np.ndarray | None]
-) -> np.ndarray | None:
-    """Removes the first array whose name has a meaning and that fits, and returns it; None if there is none."""
-    for name in with_meaning(meaning, arrays):
-        values = convert(arrays[name])
-        if values is not None:
-            del arrays[name]
-            return values
-    return None
 
 
 def _integers(values: np.ndarray) -> np.ndarray | None:
@@ -199,36 +192,6 @@ def _integers(values: np.ndarray) -> np.ndarray | None:
 def _logicals(values: np.ndarray) -> np.ndarray | None:
     texts = values.dtype.kind in "SU" and np.isin(values.astype(str), ("T", "F", "True", "False")).all()
     return _integers(np.char.startswith(values.astype(str), "T")) if texts else _integers(values)
-
-
-def _strings(values: np.ndarray) -> np.ndarray | None:
-    return values.astype(str) if values.ndim == 1 and values.dtype.kind in "SU" else None
-
-
-def _vectors(values: np.ndarray, axes: Sequence[int]) -> np.ndarray | None:
-    fits = values.ndim == 2 and max(axes) < values.shape[1] <= len(AXES) and values.dtype.kind in "iuf"
-    return values[:, axes] if fits else None
-
-
-def _take_components(arrays: dict[str, np.ndarray], axes: Sequence[int]) -> np.ndarray | None:
-    """Removes a velocity that is stored as an array per axis, and returns it (N, D)."""
-    plain = by_plain_name(name for name, values in arrays.items() if values.ndim == 1 and values.dtype.kind in "iuf")
-    names = component_names(plain, "velocity")
-    if len(names) <= max(axes):
-        return None
-    columns = [arrays.pop(name) for name in names]
-    return np.stack([columns[axis] for axis in axes], axis=1)
-
-
-def _scalars(name: str, values: np.ndarray) -> Iterable[tuple[str, np.ndarray]]:
-    """Names and (N,) values of an array's components; nothing for strings."""
-    if values.dtype.kind not in "biuf":
-        return []
-    name = "particle_time" if name == "time" else name.replace("/", "_")
-    if values.ndim == 1:
-        return [(name, values)]
-    ends = AXES if values.shape[1] <= len(AXES) else range(values.shape[1])
-    return [(f"{name}_{end}", column) for end, column in zip(ends, values.T, strict=False)]
 
 
 _log = logging.getLogger(__name__)
@@ -308,7 +271,10 @@ class FrameStack:
         if arrays.velocity is not None:
             values["velocity"] = arrays.velocity
         if first:
-            self._values = {name: self._empty_array(array) for name, array in values.items()}
+            for name, array in values.items():
+                exact = array.dtype.kind in "iu" and array.dtype.itemsize > 2
+                shape = (self._frames, self._room, *array.shape[1:])
+                self._values[name] = np.full(shape, np.nan, np.float64 if exact else np.float32)
         for name in sorted((set(self._values) ^ set(values)) - self._left_out):
             _log.warning("%s: the array %r is not in all frames; it is left out.", where, one_line(name, 60))
             self._left_out.add(name)
@@ -318,12 +284,6 @@ class FrameStack:
                 shapes = f"{values[name].shape[1:]} per particle, but {array.shape[2:]} in {self._first}"
                 raise DataError(f"{where}: {one_line(name, 60)!r} has the shape {shapes}.")
             array[self._count, slots] = values[name]
-
-    def _empty_array(self, values: np.ndarray) -> np.ndarray:
-        """An array of all frames for values as those of one."""
-        exact = values.dtype.kind in "iu" and values.dtype.itemsize > 2
-        shape = (self._frames, self._room, *values.shape[1:])
-        return np.full(shape, np.nan, np.float64 if exact else np.float32)
 
     def _position(self, values: np.ndarray, where: str) -> np.ndarray:
         """(N, D) float32 of the axes that are kept."""
@@ -406,6 +366,9 @@ class FrameStack:
     def trajectory(self, where: str) -> Trajectory:
         """The frames as a trajectory, particles ordered by their ids.
 
+        Sizes and masses of particles that do not change in time are (N,). The field `time` (T,) are times, or else
+        steps' numbers, where two or more frames state them; the others are interpolated.
+
         Raises:
             DataError: if there are no particles; names the run by `where`.
         """
@@ -422,22 +385,16 @@ class FrameStack:
             for array in values.values():
                 for row in array:  # in place: no second copy of the run
                     row[: len(order)] = row[order]
-        values = {name: _constant(name, array[:, : len(order)]) for name, array in values.items()}
-        position, ids = values.pop("position"), {ID: self._ids[order]} if self._has_ids else {}
-        return Trajectory(position, types[order], {}, values | ids | self._time())
-
-    def _time(self) -> dict[str, np.ndarray]:
-        """The field `time` (T,), or steps' numbers, where two or more frames state it; the others are interpolated."""
-        for values in map(np.array, (self._times, self._steps)):
-            stated = np.flatnonzero(~np.isnan(values))
-            if len(stated) >= max(2, len(values) // 2) and np.ptp(values[stated]) > 0:
-                return {"time": np.interp(np.arange(len(values)), stated, values[stated])}
-        return {}
-
-
-def _constant(name: str, values: np.ndarray) -> np.ndarray:
-    """(N,) sizes and masses of particles where (T, N) ones do not change in time."""
-    if plain_name(name) not in _PROPERTIES:
-        return values
-    last = np.fmax.reduce(values)
-    return last if ((values == last) | np.isnan(values)).all() else values
+        for name, array in values.items():
+            values[name] = array[:, : len(order)]
+            if plain_name(name) in _PROPERTIES:
+                last = np.fmax.reduce(values[name])
+                if ((values[name] == last) | np.isnan(values[name])).all():
+                    values[name] = last
+        position, fields = values.pop("position"), values | ({ID: self._ids[order]} if self._has_ids else {})
+        for times in map(np.array, (self._times, self._steps)):
+            stated = np.flatnonzero(~np.isnan(times))
+            if len(stated) >= max(2, len(times) // 2) and np.ptp(times[stated]) > 0:
+                fields["time"] = np.interp(np.arange(len(times)), stated, times[stated])
+                break
+        return Trajectory(position, types[order], {}, fields)

@@ -6,7 +6,6 @@ They are read by gsd, which crashes on damaged files: in child processes (`nmpm.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -92,11 +91,11 @@ def _frame(chunks: Mapping[str, np.ndarray], index: int) -> Frame:
             arrays["type"] = np.array(texts)[types]
     step = chunks.get(_STEP)
     number = (0 if index == 0 else None) if step is None else int(step[0])
-    frame = Frame(position.astype(np.float64), arrays, None, number)
+    position = position.astype(np.float64)
     if (values := chunks.get("configuration/box")) is None:
-        return frame
+        return Frame(position, arrays, None, number)
     lengths, tilts = values[:3].astype(np.float64).tolist(), values[3:]
     if tilts.any():
         raise DataError(f"its box is triclinic (tilt {tilts[tilts != 0][0]:g}), only rectangular boxes can be read.")
     box = tuple((-length / 2, length / 2) for length in lengths)
-    return replace(frame, position=wrap(frame.position, box, _PERIODIC), box=box, boundary=_PERIODIC)
+    return Frame(wrap(position, box, _PERIODIC), arrays, None, number, box, _PERIODIC)

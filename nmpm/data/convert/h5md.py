@@ -6,7 +6,7 @@ Groups are materials, but for `all`, of which others are parts (https://nongnu.o
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -95,8 +95,7 @@ class _Group:
                 arrays[name] = row
         left_out = tuple(name for name in self._elements if name not in arrays)
         box, boundary = self._box_at(index, step)
-        frame = Frame(wrap(position, box, boundary), arrays, time, step, left_out=left_out)
-        return replace(frame, box=box, boundary=boundary)
+        return Frame(wrap(position, box, boundary), arrays, time, step, box, boundary, left_out)
 
     def _box_at(self, index: int, step: int | None) -> tuple[tuple[Interval, ...] | None, tuple[Boundary, ...] | None]:
         """The box and its boundary, where an axis is periodic; else neither is stated."""
@@ -117,7 +116,7 @@ class _Element:
     """The values of an element: the same in all frames, or a row for each of its steps."""
 
     values: Any
-    steps: Any = None  # (rows,) or, for even steps, their distance
+    steps: Any = None  # (rows,)
     times: Any = None
     fixed: bool = False
 
@@ -127,17 +126,26 @@ class _Element:
             check_stored_size(item, where)
             return cls(item, fixed=True)
         check_stored_size(item["value"], where)
-        return cls(item["value"], _series(item.get("step")), _series(item.get("time")))
+
+        def series(name: str) -> Any:
+            stated = item.get(name)
+            if not isinstance(stated, h5py.Dataset):
+                return None
+            numbers = np.asarray(stated[()])
+            if numbers.ndim:
+                return numbers
+            rows = np.arange(*(item["value"].shape[:1] or (0,)))  # of even ones: their distance, and the first
+            return float(stated.attrs.get("offset", 0)) + float(numbers) * rows
+
+        return cls(item["value"], series("step"), series("time"))
 
     def step(self, index: int) -> int | None:
         """The step of a row."""
-        value = _at(self.steps, index)
-        return None if value is None else int(value)
+        return None if self.steps is None or index >= len(self.steps) else int(self.steps[index])
 
     def time(self, index: int) -> float | None:
         """The time of a row."""
-        value = _at(self.times, index)
-        return None if value is None else float(value)
+        return None if self.times is None or index >= len(self.times) else float(self.times[index])
 
     def row(self, index: int) -> np.ndarray:
         """The values of a row; names of those that are enumerated."""
@@ -155,17 +163,3 @@ class _Element:
             rows = [row for row in range(len(self.values)) if self.step(row) == step]
             return self.row(rows[0]) if rows else None
         return self.row(index) if index < len(self.values) else None
-
-
-def _series(item: Any) -> Any:
-    """Steps or times of rows (rows,), or of even ones their distance and the first."""
-    if not isinstance(item, h5py.Dataset):
-        return None
-    values = np.asarray(item[()])
-    return (float(values), float(item.attrs.get("offset", 0))) if values.ndim == 0 else values
-
-
-def _at(series: Any, index: int) -> float | None:
-    if isinstance(series, tuple):
-        return float(series[1] + index * series[0])
-    return None if series is None or index >= len(series) else float(series[index])

@@ -110,7 +110,15 @@ def _header(lines: Lines) -> _Header | None:
             flags = tuple(word for word in line.split()[3:] if len(word) == 2 and set(word) <= set("pfsm"))
             if len(flags) not in (0, len(AXES)):
                 raise ValueError(f"line {lines.number} has {len(flags)} boundaries, not one for each of three axes")
-            box = [_interval(lines.next()) for _ in AXES]
+            box = []
+            for _ in AXES:
+                text = lines.next()
+                low, high, *tilt = map(float, text.split())
+                if any(tilt):
+                    raise ValueError(f"its box is triclinic (tilt {tilt[0]:g}), only rectangular boxes can be read")
+                if not np.isfinite([low, high]).all() or low > high:
+                    raise ValueError(f"the bounds {text} of its box are not ascending")
+                box.append((low, high))
         elif line.startswith("ITEM: UNITS"):
             lines.next()
         else:
@@ -119,12 +127,3 @@ def _header(lines: Lines) -> _Header | None:
     if step is not None:
         raise ValueError(f"it ends at line {lines.number}, within a frame{complete_frames(start)}")
     return None
-
-
-def _interval(line: str) -> Interval:
-    low, high, *tilt = map(float, line.split())
-    if any(tilt):
-        raise ValueError(f"its box is triclinic (tilt {tilt[0]:g}), only rectangular boxes can be read")
-    if not np.isfinite([low, high]).all() or low > high:
-        raise ValueError(f"the bounds {line} of its box are not ascending")
-    return low, high

@@ -196,6 +196,15 @@ def in_plane(position: np.ndarray, dim: int, constant: Mapping[str, float], wher
     return position
 
 
+def by_folder(arrays: Arrays) -> dict[str, dict[str, ArrayLike]]:
+    """The arrays of each folder, by their names in it."""
+    folders: dict[str, dict[str, ArrayLike]] = {}
+    for name, array in arrays.items():
+        folder, _, leaf = name.rpartition("/")
+        folders.setdefault(folder, {})[leaf] = array
+    return folders
+
+
 def plain_name(name: str) -> str:
     """A name in lower case without separators."""
     return re.sub(r"[^a-z0-9]", "", name.lower())

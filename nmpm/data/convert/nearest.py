@@ -14,8 +14,7 @@ import numpy as np
 
 from nmpm.data.convert.array_files import ArrayFiles, open_arrays
 from nmpm.data.convert.named_arrays import Arrays, can_be_positions, describe, transposition, with_meaning
-from nmpm.data.convert.tables import SUFFIXES
-from nmpm.data.convert.tracks import table_columns
+from nmpm.data.convert.tables import SUFFIXES, read_columns, table_columns
 from nmpm.data.format import is_no_data
 from nmpm.errors import NmpmError
 
@@ -121,7 +120,13 @@ def _unpacking(path: Path, file: Path) -> str | None:
 
 def describe_unknown(path: Path) -> str:
     """A sentence on a file or folder that no format recognises: what it is nearest to, and what is missing."""
-    files = list(islice(_files(path), _MOST))
+
+    def inside() -> Iterator[Path]:
+        for folder, inner, names in os.walk(path):
+            inner[:] = sorted(name for name in inner if not is_no_data(name))
+            yield from (Path(folder, name) for name in sorted(names) if not is_no_data(name))
+
+    files = [path] if path.is_file() else list(islice(inside(), _MOST))
     if not files:
         return f"{path}: no known format; the folder is empty. {_PAGE}"
     suffix = Counter(file.suffix.lower() for file in files).most_common(1)[0][0]
@@ -137,7 +142,12 @@ def describe_unknown(path: Path) -> str:
     if any(first.match(pattern) for pattern in ArrayFiles.patterns):
         return f"{first}: {_array_problem(first)} {_PAGE}"
     if any(first.match(pattern) for pattern in SUFFIXES):
-        return f"{_table_problem(first)} {_PAGE}"
+        try:
+            table_columns(first)
+            return f"{first}: a table with the columns {', '.join(read_columns(first))}. {_PAGE}"
+        except NmpmError as error:
+            wanted = "A table of tracks has a row for each particle in each frame: frame or time, id, x, y."
+            return f"{error} {wanted} {_PAGE}"
     shown = ", ".join(str(file.relative_to(path)) for file in files[:8]) if path.is_dir() else "a file"
     return f"{path}: no known format; found {shown}. If you can load it in Python: {_WRITE}. {_PAGE}"
 
@@ -150,28 +160,19 @@ def describe_several(path: Path, datasets: Sequence[Path]) -> str:
     return f"{path}: the folder is not one dataset but holds {several}: name one of them, e.g. {datasets[0]}."
 
 
-def _files(path: Path) -> Iterator[Path]:
-    if path.is_file():
-        yield path
-    for folder, inner, names in os.walk(path):
-        inner[:] = sorted(name for name in inner if not is_no_data(name))
-        yield from (Path(folder, name) for name in sorted(names) if not is_no_data(name))
-
-
 def _array_problem(file: Path) -> str:
     """What is wrong with the arrays of a file, and what is wanted."""
-    wanted = "positions are floats (T, N, D), or (R, T, N, D) of R runs: frames, particles, 1 to 3 axes"
     try:
         with open_arrays(file) as arrays:
             candidates = {name: array for name, array in arrays.items() if can_be_positions(array)}
             if len(candidates) > 1:
                 return f"which array are the positions? Call it position ({describe(candidates)})."
-            return _wrong_positions(arrays, file.suffix) or f"no array can be positions ({describe(arrays)}); {wanted}."
+            return _wrong_positions(arrays, file.suffix)
     except NmpmError as error:
         return str(error).removeprefix(f"{file}: ")
 
 
-def _wrong_positions(arrays: Arrays, suffix: str) -> str | None:
+def _wrong_positions(arrays: Arrays, suffix: str) -> str:
     """What is wrong with the shape of the array that is called positions, or else of the largest one."""
     if {"particles", "solver_data"} <= set(arrays):
         return f"PySPH's .npz holds Python objects, which are not unpickled. {_PYSPH}"
@@ -179,29 +180,22 @@ def _wrong_positions(arrays: Arrays, suffix: str) -> str | None:
     named = [leaves[leaf] for leaf in with_meaning("position", leaves)]
     numbers = [name for name, array in arrays.items() if array.dtype.kind in "fiuO"]
     largest = sorted(numbers, key=lambda name: -int(np.prod(arrays[name].shape)))
-    for name in (named or largest)[:1]:
-        kind, shape = arrays[name].dtype, tuple(arrays[name].shape)
-        problem = f"{name!r} is {kind} of shape {shape}; positions are (T, N, D), or (R, T, N, D) of R runs"
-        if kind.hasobject:
-            return (
-                f"{name!r} holds Python objects, which are not unpickled: save each run as run0, run1, … by np.savez."
-            )
-        if kind.kind in "SU":
-            return f"{name!r} holds texts; save numbers: .astype(float)."
-        if (found := transposition(arrays[name])) is not None:
-            order, axes = found
-            leaf = name.split("/")[-1]
-            matlab = f"in MATLAB permute({leaf}, {[axis + 1 for axis in order]}), or "
-            way = f"{matlab if suffix == '.mat' else ''}np.transpose({leaf}, {order}) and {_WRITE}"
-            return f"{problem}; its axes look like ({axes}): {way}."
-        if len(shape) == 2 and shape[1] in (2, 3):
-            return f"{problem}: this is one frame. Give the folder of the frames, or stack them: np.stack(frames)."
-        return f"{problem}: frames, particles, 1 to 3 axes."
-    return None
-
-
-def _table_problem(file: Path) -> str:
-    try:
-        return f"{file}: a table with the columns {', '.join(table_columns(file).names)}."
-    except NmpmError as error:
-        return f"{error} A table of tracks has a row for each particle in each frame: frame or time, id, x, y."
+    name = next(iter(named or largest), None)
+    if name is None:
+        wanted = "positions are floats (T, N, D), or (R, T, N, D) of R runs: frames, particles, 1 to 3 axes"
+        return f"no array can be positions ({describe(arrays)}); {wanted}."
+    kind, shape = arrays[name].dtype, tuple(arrays[name].shape)
+    if kind.hasobject:
+        return f"{name!r} holds Python objects, which are not unpickled: save each run as run0, run1, … by np.savez."
+    if kind.kind in "SU":
+        return f"{name!r} holds texts; save numbers: .astype(float)."
+    problem = f"{name!r} is {kind} of shape {shape}; positions are (T, N, D), or (R, T, N, D) of R runs"
+    if (found := transposition(arrays[name])) is not None:
+        order, axes = found
+        leaf = name.split("/")[-1]
+        matlab = f"in MATLAB permute({leaf}, {[axis + 1 for axis in order]}), or "
+        way = f"{matlab if suffix == '.mat' else ''}np.transpose({leaf}, {order}) and {_WRITE}"
+        return f"{problem}; its axes look like ({axes}): {way}."
+    if len(shape) == 2 and shape[1] in (2, 3):
+        return f"{problem}: this is one frame. Give the folder of the frames, or stack them: np.stack(frames)."
+    return f"{problem}: frames, particles, 1 to 3 axes."

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -17,7 +18,7 @@ import h5py
 import numpy as np
 
 from nmpm._support.machine import check_fits
-from nmpm.data.convert.base import UNKNOWN_LENGTH, DescribedFiles, Facts, ForeignDataset, Options, located
+from nmpm.data.convert.base import UNKNOWN_LENGTH, Facts, ForeignDataset, Options, RunFiles, located
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
 from nmpm.data.stated import find_family
@@ -53,7 +54,7 @@ _PUBLISHED = {
 }
 
 
-class NeuralMpm(DescribedFiles):
+class NeuralMpm(RunFiles):
     """A folder with folders train, valid and test of `sim_*.h5` files, or one of these.
 
     Attributes:
@@ -62,12 +63,15 @@ class NeuralMpm(DescribedFiles):
 
     summary: ClassVar[str] = "NeuralMPM's folders of sim_*.h5 files, also from the hub's iSach/NeuralMPM"
     patterns: tuple[str, ...] = ("sim_*.h5",)
+    fixed_names: ClassVar[bool] = True
+    family: ClassVar[str] = "deepmind"
     material: int | None = None
 
     def recognises(self, path: Path) -> bool:
         files = self.files(path)
         try:
-            return bool(files) and not {"particles", "boundary"}.isdisjoint(_names(next(iter(files.values()))[0]))
+            with open_hdf5(next(iter(files.values()))[0]) if files else nullcontext(()) as content:
+                return not {"particles", "boundary"}.isdisjoint(content)
         except DataError:
             return True  # damaged
 
@@ -77,7 +81,8 @@ class NeuralMpm(DescribedFiles):
         return super(NeuralMpm, reader).open(path, options)
 
     def facts(self, file: Path, options: Options) -> Facts:
-        folder, published = file.resolve().parent.parent, _published(file)
+        folder = file.resolve().parent.parent
+        published = _PUBLISHED.get(folder.name.lower())
         first = _trajectory(_content(file), published.material if published else None, file)
         if published is None and options.dt is None:
             raise DataError(
@@ -106,24 +111,14 @@ class NeuralMpm(DescribedFiles):
             notes.append("The boundary moves in the first trajectory.")
         if _GRAVITY in first.fields:
             notes.append("`grav` is kept as a field, and used as gravity in length/s² where it has D numbers.")
-        return Facts(metadata, notes=tuple(notes), has_family=True)
+        return Facts(metadata, notes=tuple(notes))
 
     def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:  # noqa: ARG002
-        published, content = _published(file), _content(file)
+        published, content = _PUBLISHED.get(file.resolve().parent.parent.name.lower()), _content(file)
         material = published.material if published else self.material
         if published is None and "types" not in content and material is None:
             raise DataError(f"{file}: it does not state the particles' material. State it: --types 5=water.")
         yield _trajectory(content, material, file)
-
-
-def _published(file: Path) -> _Published | None:
-    """The published dataset whose name the folder around the splits has."""
-    return _PUBLISHED.get(file.resolve().parent.parent.name.lower())
-
-
-def _names(path: Path) -> list[str]:
-    with open_hdf5(path) as file:
-        return list(file)
 
 
 def _content(path: Path) -> dict[str, np.ndarray]:

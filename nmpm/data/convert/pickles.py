@@ -1,6 +1,11 @@
-"""Pickled rollouts of DeepMind's code and its PyTorch successors, and the restricted unpickler that reads them.
+"""Formats with pickles, and the restricted unpickler that reads them.
 
-It reads NumPy arrays, numbers, texts and containers of them, and runs nothing else.
+Rollouts of DeepMind's code and its PyTorch successors are one pickle each. The `.npz` files of geoelements/gns hold an
+array of objects per trajectory: members are named `simulation_trajectory_0` or `simulation_0`, and so on; each holds
+(positions (T, N, D), one type or (N,) types) and in some datasets a material property, one or (N,). Newer files hold
+one member, `gns_data`, with a row per trajectory.
+
+The unpickler reads NumPy arrays, numbers, texts and containers of them, and runs nothing else.
 
 A pickle is a program that calls constructors by name. The few that NumPy arrays need are replaced by functions that
 check their arguments; a request for any other name is an error that names it.
@@ -13,6 +18,7 @@ import math
 import pickle
 import re
 import struct
+import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -21,8 +27,9 @@ import numpy as np
 
 from nmpm._support.bounded_files import read_bounded
 from nmpm._support.messages import one_line
-from nmpm.data.convert.base import DescribedFiles, Facts, Options
-from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.convert.array_files import NpzArray, npz_members
+from nmpm.data.convert.base import Facts, Options, Run, RunFiles, located
+from nmpm.data.format import METADATA_FILE, Metadata, Trajectory, read_metadata
 from nmpm.data.metadata import parse_metadata
 from nmpm.errors import DataError
 
@@ -76,11 +83,6 @@ def _encode(text: str, encoding: str) -> bytes:
     return text.encode("latin1")
 
 
-def _no_bytes() -> bytes:
-    """Decodes b"" as pickle protocols below 3 write it."""
-    return b""
-
-
 class _ArrayUnpickler(pickle._Unpickler):
     """Python's unpickler; that in C allocates what an instruction asks for."""
 
@@ -93,7 +95,7 @@ class _ArrayUnpickler(pickle._Unpickler):
         "numpy._core.multiarray.scalar": _scalar,
         "numpy._core.numeric._frombuffer": _from_buffer,
         "_codecs.encode": _encode,
-        "__builtin__.bytes": _no_bytes,
+        "__builtin__.bytes": lambda: b"",  # as protocols below 3 write it
     }
 
     def find_class(self, module: str, name: str) -> Any:
@@ -153,11 +155,13 @@ _BYTES = 2**31
 _NEEDED = ("initial_positions", "ground_truth_rollout", "particle_types", "metadata")
 
 
-class RolloutPickle(DescribedFiles):
+class RolloutPickle(RunFiles):
     """A `rollout_*.pkl` of DeepMind's code or its PyTorch successors, or a folder of them."""
 
     summary: ClassVar[str] = "rollouts as DeepMind's code pickles them (ground_truth_rollout, …)"
     patterns: tuple[str, ...] = ("*.pkl",)
+    fixed_names: ClassVar[bool] = True
+    family: ClassVar[str] = "deepmind"
 
     def facts(self, file: Path, options: Options) -> Facts:
         stated = _content(file)["metadata"]
@@ -169,7 +173,7 @@ class RolloutPickle(DescribedFiles):
             "The true trajectories become the positions; the predictions are kept as the field predicted_rollout, with"
             " the initial positions in front."
         )
-        return Facts(parse_metadata(plain, file, options.family or self.family), notes=(note,), has_family=True)
+        return Facts(parse_metadata(plain, file, options.family or self.family), notes=(note,))
 
     def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:  # noqa: ARG002
         content = _content(file)
@@ -191,3 +195,70 @@ def _content(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or not all(key in content for key in _NEEDED):
         raise DataError(f"{path}: a rollout is a dict of {', '.join(_NEEDED)}; this is something else.")
     return content
+
+
+_ALL = "gns_data"
+
+
+class GnsNpz(RunFiles):
+    """NumPy files with a `metadata.json` beside them."""
+
+    summary: ClassVar[str] = "NumPy files of geoelements/gns with metadata.json"
+    patterns: tuple[str, ...] = ("*.npz",)
+    fixed_names: ClassVar[bool] = True
+    family: ClassVar[str] = "deepmind"
+
+    def recognises(self, path: Path) -> bool:
+        return super().recognises(path) and ((path if path.is_dir() else path.parent) / METADATA_FILE).is_file()
+
+    def facts(self, file: Path, options: Options) -> Facts:
+        return Facts(read_metadata(file.parent, options.family or self.family))
+
+    def runs(self, file: Path) -> Sequence[Run]:
+        return [Run(file, index) for index in range(sum(count for _, _, count in _members(file)))]
+
+    def read(self, file: Path, indices: Sequence[int], metadata: Metadata) -> Iterator[Trajectory]:  # noqa: ARG002
+        for array, where, count in _members(file):
+            content: Any = load_pickled(array.pickled(), where) if array.dtype.hasobject else array[()]
+            rows = [content] if where != f"{file}: {_ALL}" else list(content) if getattr(content, "ndim", 0) else []
+            if len(rows) != count:
+                raise DataError(f"{where}: its header states {count} trajectories; it holds {len(rows)}.")
+            for row in rows:
+                yield _trajectory(row, where)
+
+
+def _members(file: Path) -> Iterator[tuple[NpzArray, str, int]]:
+    """Yields each member, where it is, and its number of trajectories."""
+    names = npz_members(file)
+    with zipfile.ZipFile(file) as archive:
+        for name in names:
+            where = f"{file}: {one_line(name, 60)}"
+            array = NpzArray(archive, name, where)
+            yield array, where, (*array.shape, 0)[0] if name == _ALL else 1
+
+
+def _trajectory(row: Any, where: str) -> Trajectory:
+    parts: list[Any] = [*row] if isinstance(row, np.ndarray | list | tuple) else []
+    if len(parts) not in (2, 3):
+        raise DataError(
+            f"{where}: expected (positions, types) or (positions, types, property); found {len(parts)} parts."
+        )
+    position = number_array(parts[0], f"{where}: positions")
+    if position.ndim != 3:
+        raise DataError(f"{where}: positions must have the shape (T, N, D); they have {position.shape}.")
+    types = _per_particle(parts[1], position.shape[1], f"{where}: types").astype(np.int64)
+    fields = {}
+    if len(parts) == 3:
+        fields["material_property"] = _per_particle(parts[2], position.shape[1], f"{where}: material property")
+    with located(where):
+        return Trajectory(position.astype(np.float32), types, {}, fields)
+
+
+def _per_particle(value: Any, particles: int, where: str) -> np.ndarray:
+    """(N,) numbers, from one per particle or one for all."""
+    numbers = number_array(value, where)
+    if numbers.size not in (1, particles) or numbers.ndim > 1:
+        raise DataError(
+            f"{where}: expected one number, or one for each of {particles} particles; found shape {numbers.shape}."
+        )
+    return np.broadcast_to(numbers.reshape(-1), particles).copy()

@@ -31,36 +31,26 @@ class Ply(FrameFormat):
         import plyfile
 
         with readable(file, "PLY", plyfile.PlyParseError, LookupError, TypeError):
-            _check_sizes(plyfile, file)
-            content = plyfile.PlyData.read(str(file))
-        yield _frame(content, file)
-
-
-def _check_sizes(plyfile: Any, file: Path) -> None:
-    """Raises ValueError if a file declares more rows than fit into it."""
-    size = file.stat().st_size
-    with file.open("rb") as stream:
-        header = plyfile.PlyData._parse_header(stream)
-    for element in header.elements:
-        row = 2 * len(element.properties) if header.text else element.dtype().itemsize  # (lists are pointers)
-        least = row if header.text or not any(hasattr(one, "len_dtype") for one in element.properties) else 1
-        if element.count * least > size + 1:
-            raise ValueError(f"it declares {element.count:,} rows of {element.name} but has {size:,} bytes")
-
-
-def _frame(content: Any, file: Path) -> Frame:
-    elements = {element.name: element for element in content.elements}
-    vertices: Any = elements["vertex"].data if "vertex" in elements else np.zeros(0)
-    names = vertices.dtype.names or ()
-    axes = [axis for axis in AXES if axis in names]
-    if len(axes) < 2:
-        raise DataError(f"{file}: it has no element vertex with x, y (found: {', '.join([*elements, *names])}).")
-    position = np.stack([vertices[axis].astype(np.float64) for axis in axes], axis=1)
-    arrays = {name: np.array(vertices[name]) for name in names if name not in axes and vertices[name].dtype != object}
-    times = (_TIME.search(comment) for comment in (*content.comments, *content.obj_info))
-    left_out = (
-        *(name for name in elements if name != "vertex"),
-        *(name for name in names if vertices[name].dtype == object),
-    )
-    stated = next((match[1] for match in times if match), "")
-    return Frame(position, arrays, float(stated) if is_number(stated) else None, left_out=left_out)
+            size = file.stat().st_size
+            with file.open("rb") as stream:
+                header = plyfile.PlyData._parse_header(stream)
+            for element in header.elements:
+                row = 2 * len(element.properties) if header.text else element.dtype().itemsize  # (lists are pointers)
+                has_lists = any(hasattr(each, "len_dtype") for each in element.properties)
+                if element.count * (1 if has_lists and not header.text else row) > size + 1:
+                    raise ValueError(f"it declares {element.count:,} rows of {element.name} but has {size:,} bytes")
+            content: Any = plyfile.PlyData.read(str(file))
+        elements = {element.name: element for element in content.elements}
+        vertices: Any = elements["vertex"].data if "vertex" in elements else np.zeros(0)
+        names = vertices.dtype.names or ()
+        axes = [axis for axis in AXES if axis in names]
+        if len(axes) < 2:
+            found = ", ".join([*elements, *names])
+            raise DataError(f"{file}: it has no element vertex with x, y (found: {found}).")
+        position = np.stack([vertices[axis].astype(np.float64) for axis in axes], axis=1)
+        lists = [name for name in names if vertices[name].dtype == object]
+        arrays = {name: np.array(vertices[name]) for name in names if name not in {*axes, *lists}}
+        times = (_TIME.search(comment) for comment in (*content.comments, *content.obj_info))
+        stated = next((match[1] for match in times if match), "")
+        left_out = (*(name for name in elements if name != "vertex"), *lists)
+        yield Frame(position, arrays, float(stated) if is_number(stated) else None, left_out=left_out)

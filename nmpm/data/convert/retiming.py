@@ -47,13 +47,22 @@ def retime(dataset: ForeignDataset, options: Options) -> ForeignDataset:
         DataError: on reading, if there are no times to resample.
     """
     if options.dt is not None:
-        dataset = dataset.map(_without_times)
+        dataset = dataset.map(lambda run: replace(run, fields={n: v for n, v in run.fields.items() if n != "time"}))
     if options.resample is not None:
         if dataset.steps:
             dataset = dataset.map(_with_steps_as_times)
         dt = None if "dt" in dataset.unknown else dataset.metadata.dt
         metadata = replace(dataset.metadata, dt=options.resample, sequence_length=UNKNOWN_LENGTH)
-        dataset = dataset.map(partial(_resample_stored, dt=dt, step=options.resample, metadata=metadata), metadata)
+        step = options.resample
+
+        def resampled(trajectory: Trajectory) -> Trajectory:
+            if (time := recorded_times(trajectory)) is None:
+                if dt is None:
+                    raise DataError("Frames without times cannot be resampled: state the time between them (--dt).")
+                time = dt * np.arange(len(trajectory.position))
+            return resample(*_in_order(trajectory, time), step, metadata)
+
+        dataset = dataset.map(resampled, metadata)
         note = f"Positions are interpolated to frames that are {options.resample:g} apart in time."
         dataset = replace(dataset, notes=(*dataset.notes, note), unknown=dataset.unknown - {"dt"})
     if options.smooth is not None:
@@ -63,25 +72,12 @@ def retime(dataset: ForeignDataset, options: Options) -> ForeignDataset:
     return dataset
 
 
-def _without_times(trajectory: Trajectory) -> Trajectory:
-    return replace(trajectory, fields={name: values for name, values in trajectory.fields.items() if name != "time"})
-
-
 def _with_steps_as_times(trajectory: Trajectory) -> Trajectory:
     """The trajectory with times in place of numbers of steps, where velocities tell how long a step is."""
     numbers, by_velocity = recorded_times(trajectory), step_by_velocities([take_sample(trajectory)])
     if numbers is None or by_velocity is None:
         return trajectory
     return replace(trajectory, fields=trajectory.fields | {"time": numbers * (by_velocity / usual_step(numbers))})
-
-
-def _resample_stored(trajectory: Trajectory, dt: float | None, step: float, metadata: Metadata) -> Trajectory:
-    time = recorded_times(trajectory)
-    if time is None:
-        if dt is None:
-            raise DataError("Frames without times cannot be resampled: state the time between them (--dt).")
-        time = dt * np.arange(len(trajectory.position))
-    return resample(*_in_order(trajectory, time), step, metadata)
 
 
 def _in_order(trajectory: Trajectory, time: np.ndarray) -> tuple[Trajectory, np.ndarray]:
@@ -144,15 +140,12 @@ def resample(trajectory: Trajectory, time: np.ndarray, step: float, metadata: Me
             return slice(first, last), np.broadcast_to(tracks, (last - first, *tracks.shape[1:]))
         return slice(first, last), CubicSpline(recorded, tracks)(new[first:last])
 
-    def at_new_times(values: np.ndarray, periods: np.ndarray) -> np.ndarray:
-        return _by_pieces(values, breaks, len(new), periods, spline)
-
-    position = _wrapped(trajectory.position, metadata, at_new_times)
+    position = _by_pieces(trajectory.position, breaks, len(new), spline, metadata)
     end = int(np.flatnonzero(~np.isnan(position[..., 0]).all(axis=1))[-1]) + 1
     fields = {"time": new[:end]}
     for name, values in trajectory.fields.items():
         if values.shape[:2] == (frames, particles) and values.dtype.kind == "f":
-            fields[name] = at_new_times(values, np.zeros(int(np.prod(values.shape[2:]))))[:end]
+            fields[name] = _by_pieces(values, breaks, len(new), spline)[:end]
         elif values.shape[:2] == (frames, particles) or (values.shape == (frames,) and frames != particles):
             fields.setdefault(name, values[nearest][:end])
         else:
@@ -175,18 +168,16 @@ def smooth(trajectory: Trajectory, frames: int, metadata: Metadata) -> Trajector
             tracks = basis @ (basis.T @ tracks)
         return slice(*piece), tracks
 
-    def smoothed(values: np.ndarray, periods: np.ndarray) -> np.ndarray:
-        return _by_pieces(values, np.empty(0, int), len(values), periods, fit)
-
-    return replace(trajectory, position=_wrapped(trajectory.position, metadata, smoothed))
+    position = trajectory.position
+    return replace(trajectory, position=_by_pieces(position, np.empty(0, int), len(position), fit, metadata))
 
 
 def _by_pieces(
     values: np.ndarray,
     breaks: np.ndarray,
     length: int,
-    periods: np.ndarray,
     change: Callable[[Piece, np.ndarray], tuple[slice, np.ndarray]],
+    metadata: Metadata | None = None,
 ) -> np.ndarray:
     """(T', N, …) values of the same type: the pieces of (T, N, …) ones, each changed; NaN between them.
 
@@ -194,20 +185,24 @@ def _by_pieces(
         values: NaN where a particle is absent.
         breaks: Frames at which pieces end also where the particle is there.
         length: T'.
-        periods: (C,) periods of the C components, 0 for none; jumps across their borders are removed.
         change: Called with a piece and its (n, N' C) float64 values; returns which frames it gives, and their values.
+        metadata: Of positions: jumps across the borders of periodic axes are removed, and results within the bounds.
     """
     frames, particles = values.shape[:2]
     flat = values.reshape(frames, particles, -1)
+    lower, upper = np.asarray(metadata.bounds).T if metadata else np.zeros((2, 0))
+    periodic = np.flatnonzero(metadata.periodic) if metadata else np.zeros(0, int)
     result = np.full((length, particles, flat.shape[2]), np.nan, values.dtype)
     for piece, index in _pieces(~np.isnan(flat[..., 0]), breaks):
         most = max(1, _VALUES // (max(piece[1] - piece[0], length) * flat.shape[2]))
         for some in np.split(index, range(most, len(index), most)):
             tracks = flat[piece[0] : piece[1], some].astype(np.float64)
-            for component in np.flatnonzero(periods):
-                tracks[..., component] = np.unwrap(tracks[..., component], period=periods[component], axis=0)
+            for axis in periodic:
+                tracks[..., axis] = np.unwrap(tracks[..., axis], period=upper[axis] - lower[axis], axis=0)
             target, changed = change(piece, tracks.reshape(len(tracks), -1))
             result[target, some] = changed.reshape(len(changed), len(some), -1)
+    for axis in periodic:
+        result[..., axis] = lower[axis] + np.mod(result[..., axis] - lower[axis], upper[axis] - lower[axis])
     return result.reshape(length, particles, *values.shape[2:])
 
 
@@ -225,15 +220,3 @@ def _pieces(present: np.ndarray, breaks: np.ndarray) -> Iterator[tuple[Piece, np
     bounds = np.searchsorted(number.reshape(-1)[order], np.arange(len(pieces) + 1))
     for (begin, stop), low, high in zip(pieces.tolist(), bounds[:-1], bounds[1:], strict=True):
         yield (begin, stop), particle[order[low:high]]
-
-
-def _wrapped(
-    position: np.ndarray, metadata: Metadata, change: Callable[[np.ndarray, np.ndarray], np.ndarray]
-) -> np.ndarray:
-    """Changed (T, N, D) positions, within the bounds of periodic axes."""
-    lower, upper = np.asarray(metadata.bounds).T
-    periods = np.where(metadata.periodic, upper - lower, 0.0)
-    changed = change(position, periods)
-    for axis in np.flatnonzero(periods):
-        changed[..., axis] = lower[axis] + np.mod(changed[..., axis] - lower[axis], periods[axis])
-    return changed

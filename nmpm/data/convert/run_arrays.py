@@ -32,6 +32,7 @@ from nmpm.data.convert.named_arrays import (
     Arrays,
     as_text,
     as_times,
+    by_folder,
     can_be_positions,
     constant_axis,
     describe,
@@ -46,10 +47,10 @@ from nmpm.data.convert.named_arrays import (
     type_ids,
     usual_position,
 )
-from nmpm.data.convert.tracks import TrackRows
+from nmpm.data.convert.tables import TrackRows
 from nmpm.data.format import ID, SPLITS, TRACK, Metadata, Trajectory
 from nmpm.errors import DataError
-from nmpm.scene import Boundary, Interval
+from nmpm.scene import Boundary
 
 
 @dataclass(frozen=True)
@@ -98,22 +99,20 @@ class RunArrays:
         """Names of the further arrays that fit frames or particles."""
         others = (name for name in self.arrays if name not in self.roles.values())
         numbers = ((name, self.arrays[name]) for name in others if self.arrays[name].dtype.kind in "biuf")
-        return tuple(name for name, array in numbers if self._fits(array.shape) or self._per_run(array))
+        return tuple(name for name, array in numbers if self._fits(array.shape) or self._per_run(array.shape))
 
     def _fits(self, shape: Sequence[int]) -> bool:
         return not shape or shape[0] in self._shape[-3:-1]
 
-    def _per_run(self, array: ArrayLike) -> bool:
-        """Whether the first axis of an array counts the runs."""
-        shape = array.shape
-        if not shape or shape[:1] != self._shape[:-3]:
-            return False
-        return not self._fits(shape) if len(shape) == 1 else self._fits(shape[1:])
+    def _per_run(self, shape: Sequence[int]) -> bool:
+        """Whether the first axis of an array of this shape counts the runs."""
+        runs = bool(shape) and tuple(shape[:1]) == self._shape[:-3]
+        return runs and (not self._fits(shape) if len(shape) == 1 else self._fits(shape[1:]))
 
     def _take(self, name: str, run: int) -> np.ndarray:
         """An array in a run; (T, N, 1), (N, 1) and (T, 1) values without their last axis, but for vectors."""
         array = self.arrays[name]
-        values, sizes = np.asarray(array[run] if self._per_run(array) else array[()]), self._shape[-3:-1]
+        values, sizes = np.asarray(array[run] if self._per_run(array.shape) else array[()]), self._shape[-3:-1]
         shapes = (sizes, sizes[1:], sizes[:1])
         vectors = {self.roles.get(meaning) for meaning in ("position", "velocity", "bounds")}
         one = values.ndim > 1 and values.shape[-1] == 1 and values.shape not in shapes and values.shape[:-1] in shapes
@@ -140,9 +139,14 @@ class RunArrays:
 
     def _stated(self, dim: int, constant: Mapping[str, float]) -> dict[str, Any]:
         """Fields of `Metadata` that arrays state, for data of so many axes."""
-        bounds = [bound for axis, bound in zip(AXES, self._bounds(), strict=False) if axis not in constant]
-        types, names = self.roles.get("types"), self._fact("type_names")
-        facts: dict[str, Any] = {"bounds": tuple(bounds)}
+        types, names, bounds = self.roles.get("types"), self._fact("type_names"), self._fact("bounds")
+        facts: dict[str, Any] = {}
+        if bounds is not None and bounds.shape in ((self._shape[-1], 2), (2, self._shape[-1])):
+            transposed = bounds.shape == (2, self._shape[-1]) and self._shape[-1] != 2
+            low, high = (bounds if transposed else bounds.T).astype(np.float64)
+            if np.isfinite([low, high]).all() and (low < high).all():
+                each = zip(AXES, low.tolist(), high.tolist(), strict=False)
+                facts["bounds"] = tuple((lower, upper) for axis, lower, upper in each if axis not in constant)
         if types is not None and self.arrays[types].dtype.kind in "SUO":  # stored as names
             facts["particle_types"] = dict(enumerate(sorted(set(as_text(self.arrays[types][()]).flat))))
         elif names is not None:
@@ -157,15 +161,6 @@ class RunArrays:
         if static is not None and facts.get("particle_types"):
             facts["static_types"] = frozenset(static.tolist())
         return {name: value for name, value in facts.items() if value or name == "static_types"}
-
-    def _bounds(self) -> tuple[Interval, ...]:
-        """(lower, upper) per axis, from (D, 2) or (2, D) numbers; () where there are none that fit."""
-        values, dim = self._fact("bounds"), self._shape[-1]
-        if values is None or values.shape not in ((dim, 2), (2, dim)):
-            return ()
-        low, high = (values if values.shape == (2, dim) and dim != 2 else values.T).astype(np.float64)
-        fits = np.isfinite([low, high]).all() and (low < high).all()
-        return tuple(zip(low.tolist(), high.tolist(), strict=True)) if fits else ()
 
     def read(self, run: int, metadata: Metadata) -> Trajectory:
         """The trajectory of a run, with the axes and type ids of the metadata.
@@ -193,7 +188,17 @@ class RunArrays:
             if ids is not None and ids.ndim == 2:
                 return replace(_by_ids(ids, position, types, fields, where), attributes=attributes)
             fields |= {} if ids is None else {ID: ids}
-            trajectory = Trajectory(position, _constant_types(types, where), attributes, fields)
+            if types.ndim == 2:  # -1 where a particle is absent
+                absent = types == -1
+                fixed = np.take_along_axis(types, absent.argmin(axis=0)[None], axis=0)[0]
+                if (changes := (types != fixed) & ~absent).any():
+                    frame, particle = map(int, np.argwhere(changes)[0])
+                    raise DataError(
+                        f"the type of particle {particle} changes, to {types[frame, particle]} in frame {frame}. Types"
+                        " must be constant in time, but for -1 where a particle is absent."
+                    )
+                types = fixed
+            trajectory = Trajectory(position, types, attributes, fields)
         return cut(trajectory, range(len(position)))
 
     def _ids(self, run: int, fields: dict[str, np.ndarray], position: np.ndarray) -> np.ndarray | None:
@@ -276,22 +281,6 @@ def _by_ids(
     return replace(trajectory, fields=others | trajectory.fields)
 
 
-def _constant_types(types: np.ndarray, where: str) -> np.ndarray:
-    """(N,) types of (N,) or (T, N) ones, which are -1 where a particle is absent."""
-    if types.ndim == 1:
-        return types
-    absent = types == -1
-    fixed: np.ndarray = np.take_along_axis(types, absent.argmin(axis=0)[None], axis=0)[0]
-    changes = (types != fixed) & ~absent
-    if changes.any():
-        frame, particle = map(int, np.argwhere(changes)[0])
-        raise DataError(
-            f"{where}: the type of particle {particle} changes, to {types[frame, particle]} in frame {frame}. Types"
-            " must be constant in time, but for -1 where a particle is absent."
-        )
-    return fixed
-
-
 _RUN_WORDS = frozenset(
     {"run", "sim", "simulation", "traj", "trajectory", "arr", "sample", "case", "experiment", "rollout"}
 )
@@ -302,36 +291,30 @@ def group_runs(arrays: Arrays, where: str) -> Iterator[RunArrays]:
 
     Arrays outside of the runs, such as types, belong to all of them.
     """
-    folders: dict[str, dict[str, ArrayLike]] = {}
-    for name, array in arrays.items():
-        folder, _, leaf = name.rpartition("/")
-        folders.setdefault(folder, {})[leaf] = array
+    folders = by_folder(arrays)
     for folder, inside in folders.items():
         parts = folder.split("/")
         outside = ["/".join(parts[:depth]) for depth in range(len(parts)) if folder]
-        shared = {name: array for outer in outside for name, array in folders.get(outer, {}).items()}
-        shared = {name: array for name, array in shared.items() if not can_be_positions(array)}
-        yield from _runs_in_folder(inside, shared, f"{where}: {folder}" if folder else where, _split_name(folder))
-
-
-def _runs_in_folder(inside: Arrays, shared: Arrays, where: str, split: str | None) -> Iterator[RunArrays]:
-    joined = join_components(inside)
-    if usual_position(joined) is not None:
-        yield RunArrays({**shared, **joined}, where, split)
-        return
-    groups: dict[tuple[str, ...], dict[str, ArrayLike]] = {}
-    for name, array in joined.items():
-        words = re.findall(r"[A-Za-z]+|\d+", name)
-        key = tuple(word for word in words if word.isdigit() or _split_name(word))
-        base = "_".join(word for word in words if word not in key and word.lower() not in _RUN_WORDS)
-        groups.setdefault(key, {})[base or "position"] = array
-    with_positions = [key for key in groups if key and position_name(join_components(groups[key])) is not None]
-    for key in with_positions:
+        around = {name: array for outer in outside for name, array in folders.get(outer, {}).items()}
+        shared = {name: array for name, array in around.items() if not can_be_positions(array)}
+        place, split = f"{where}: {folder}" if folder else where, _split_name(folder)
+        joined = join_components(inside)
+        if usual_position(joined) is not None:
+            yield RunArrays({**shared, **joined}, place, split)
+            continue
+        groups: dict[tuple[str, ...], dict[str, ArrayLike]] = {}
+        for name, array in joined.items():
+            words = re.findall(r"[A-Za-z]+|\d+", name)
+            key = tuple(word for word in words if word.isdigit() or _split_name(word))
+            base = "_".join(word for word in words if word not in key and word.lower() not in _RUN_WORDS)
+            groups.setdefault(key, {})[base or "position"] = array
+        with_positions = [key for key in groups if key and position_name(join_components(groups[key])) is not None]
         rest = {name: array for name, array in groups.get((), {}).items() if not can_be_positions(array)}
-        label = " ".join(key)
-        yield RunArrays({**shared, **rest, **groups[key]}, f"{where}: {label}", split or _split_name(label))
-    if not with_positions and position_name(joined) is not None:
-        yield RunArrays({**shared, **joined}, where, split)
+        for key in with_positions:
+            label = " ".join(key)
+            yield RunArrays({**shared, **rest, **groups[key]}, f"{place}: {label}", split or _split_name(label))
+        if not with_positions and position_name(joined) is not None:
+            yield RunArrays({**shared, **joined}, place, split)
 
 
 def _split_name(name: str) -> str | None:
@@ -341,13 +324,6 @@ def _split_name(name: str) -> str | None:
 RunInMemory = np.ndarray | Mapping[str, np.ndarray]
 Runs = np.ndarray | Iterable[Trajectory | RunInMemory]
 """Runs as a (R, T, N, D) array, or one by one: (T, N, D) positions, arrays by name, or trajectories."""
-
-
-@dataclass(frozen=True)
-class _MemoryRun(Run):
-    """A run in memory; `file` is its number."""
-
-    source: RunArrays | Trajectory = field(kw_only=True)
 
 
 def open_runs(runs: Runs | Mapping[str, Runs], options: Options) -> ForeignDataset:
@@ -360,30 +336,31 @@ def open_runs(runs: Runs | Mapping[str, Runs], options: Options) -> ForeignDatas
     divided = isinstance(runs, Mapping) and set(runs) <= set(SPLITS)
     parts: Mapping[str, Any] = runs if isinstance(runs, Mapping) and divided else {"all": runs}
     splits = {name: list(_each(part, f"{name} " if divided else "")) for name, part in parts.items()}
-    first = next((part[0] for part in splits.values() if part), None)
+    first = next((part[0].source for part in splits.values() if part), None)
     if first is None:
         raise DataError("There are no runs to write.")
-    if isinstance(first.source, RunArrays):
-        facts = first.source.facts()
-    elif first.source.metadata is not None:
-        facts = Facts(first.source.metadata)
+    if isinstance(first, RunArrays):
+        facts = first.facts()
+    elif first.metadata is not None:
+        facts = Facts(first.metadata)
     else:
-        facts = Facts(placeholder_metadata(first.source.position.shape[2]), EVERYTHING_UNKNOWN)
-    return open_divided(splits, facts, _read, options)
+        facts = Facts(placeholder_metadata(first.position.shape[2]), EVERYTHING_UNKNOWN)
+
+    def read(runs: Sequence[Run], metadata: Metadata) -> Iterator[Trajectory]:
+        for run in runs:
+            whole = run.source if isinstance(run.source, Trajectory) else run.source.read(run.index, metadata)
+            yield whole if run.part is None else cut(whole, run.part)
+
+    return open_divided(splits, facts, read, options)
 
 
-def _read(runs: Sequence[_MemoryRun], metadata: Metadata) -> Iterator[Trajectory]:
-    for run in runs:
-        source = run.source
-        yield run.take(source if isinstance(source, Trajectory) else source.read(run.index, metadata))
-
-
-def _each(runs: Runs | Mapping[str, Any], where: str) -> Iterator[_MemoryRun]:
+def _each(runs: Runs | Mapping[str, Any], where: str) -> Iterator[Run]:
+    """The runs, with their trajectories or arrays as the source, and their number as the file."""
     items = [runs] if isinstance(runs, Mapping | np.ndarray | Trajectory) else runs
     for number, item in enumerate(items):
         name = f"{where}run {number}"
         if isinstance(item, Trajectory):
-            yield _MemoryRun(Path(name), 0, len(item.position), source=item)
+            yield Run(Path(name), 0, len(item.position), source=item)
             continue
         named = item if isinstance(item, Mapping) else {"position": item}
         arrays = {key: np.asarray(array) for key, array in named.items()}
@@ -394,4 +371,4 @@ def _each(runs: Runs | Mapping[str, Any], where: str) -> Iterator[_MemoryRun]:
             mend = "" if found is None else f" Its axes look like ({found[1]}): np.transpose(…, {found[0]})."
             raise DataError(f"{name}: none of the arrays is (T, N, D) or (R, T, N, D) positions ({shapes}).{mend}")
         for group in groups:
-            yield from (_MemoryRun(Path(name), index, group.frames, source=group) for index in range(group.count))
+            yield from (Run(Path(name), index, group.frames, source=group) for index in range(group.count))

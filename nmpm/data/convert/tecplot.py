@@ -27,8 +27,7 @@ class Tecplot(TextFrames):
     kind: ClassVar[str] = "Tecplot's text"
 
     def recognises(self, path: Path) -> bool:
-        _, files = next(self._folders(path), (path, []))
-        return any(starts_with(file, start) for file in files[:1] for start in _STARTS)
+        return any(starts_with(file, start) for file in self.first_files(path)[:1] for start in _STARTS)
 
     def blocks(self, lines: Lines) -> Iterator[tuple[str, tuple[list[str], str], bytes]]:
         number, names, header, rows = 0, list[str](), "", list[bytes]()

@@ -147,7 +147,7 @@ def parse_columns(block: bytes, names: Sequence[str]) -> dict[str, np.ndarray]:
     Raises:
         ValueError: if a line has fewer columns, or a text among numbers.
     """
-    first = first_line(block).split()
+    first = block.partition(b"\n")[0].split()
     if block and len(first) != len(names):
         raise ValueError(f"{len(first)} columns, but {len(names)} names: {one_line(' '.join(names))}")
     texts = [index for index, word in enumerate(first) if not is_number(word)]
@@ -166,11 +166,6 @@ def parse_columns(block: bytes, names: Sequence[str]) -> dict[str, np.ndarray]:
             raise ValueError(f"a line has no column {names[index]}")
         columns[names[index]] = text_array([word.decode("ascii") for (word,) in words])
     return columns
-
-
-def first_line(block: bytes) -> bytes:
-    """The first of some lines."""
-    return block[: block.find(b"\n")]
 
 
 def text_array(words: Sequence[str]) -> np.ndarray:

@@ -61,8 +61,8 @@ def _read(path: Path, time: float | None) -> Frame:
     """The points of a file; `time` overrides that in the file."""
     needs(path, "VTK", "pyvista", "vtk", module="vtkmodules")
     content = call_isolated(read_points, path)
-    content["left_out"] = tuple(content["left_out"])
-    return Frame(**content if time is None else content | {"time": time})
+    stated = {} if time is None else {"time": time}
+    return Frame(**content | stated | {"left_out": tuple(content["left_out"])})
 
 
 def _entries(path: Path) -> list[tuple[Path, float]]:
@@ -102,12 +102,16 @@ def read_points(path: Path) -> dict[str, Any]:
     """
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
+    from vtkmodules.vtkCommonDataModel import VTK_POLY_VERTEX, VTK_VERTEX, vtkCellTypes
     from vtkmodules.vtkIOLegacy import vtkGenericDataObjectReader
     from vtkmodules.vtkIOXML import vtkXMLGenericDataObjectReader
 
     legacy = path.suffix.lower() == ".vtk"
     if legacy:
-        _check_legacy(path)
+        with path.open("rb") as file:
+            header = file.read(_HEADER_BYTES)
+        declared = re.findall(rb"^\s*POINTS\s+(-?\d{1,18})", header, re.MULTILINE | re.IGNORECASE)
+        _check_counts(path, list(map(int, declared)), path.stat().st_size // _POINT_BYTES)
         reader = vtkGenericDataObjectReader()
         for switch in ("Scalars", "Vectors", "Normals", "Tensors", "TCoords", "Fields"):
             getattr(reader, f"ReadAll{switch}On")()
@@ -139,19 +143,16 @@ def read_points(path: Path) -> dict[str, Any]:
         if len(array) != len(position):
             raise DataError(f"{path}: {one_line(name, 40)} has {len(array)} values for {len(position)} points.")
     left_out = [] if fit else [f"{name} of cells" for name in cell_arrays]
-    fields = {"position": position, "arrays": arrays, "time": _time(output)}
-    return fields | {"left_out": left_out, "surface": _has_faces(output)}
-
-
-def _has_faces(output: Any) -> bool:
-    """Whether there are cells other than single points and sets of points."""
-    from vtkmodules.vtkCommonDataModel import VTK_POLY_VERTEX, VTK_VERTEX, vtkCellTypes
-
     kinds = vtkCellTypes()
     output.GetCellTypes(kinds)
-    return any(
-        kinds.GetCellType(index) not in (VTK_VERTEX, VTK_POLY_VERTEX) for index in range(kinds.GetNumberOfTypes())
-    )
+    faces = {kinds.GetCellType(index) for index in range(kinds.GetNumberOfTypes())} - {VTK_POLY_VERTEX, VTK_VERTEX}
+    return {
+        "position": position,
+        "arrays": arrays,
+        "time": _time(output),
+        "left_out": left_out,
+        "surface": bool(faces),
+    }
 
 
 def _text(value: str | bytes | None) -> str:
@@ -186,83 +187,64 @@ def _kind_error(path: Path, kind: str) -> DataError:
     return DataError(f"{path}: it has a {one_line(kind, 40)}; particles are points.")
 
 
-def _check_legacy(path: Path) -> None:
-    """Refuses a legacy file that declares more points than fit into it."""
-    with path.open("rb") as file:
-        start = file.read(_HEADER_BYTES)
-    declared = re.findall(rb"^\s*POINTS\s+(-?\d{1,18})", start, re.MULTILINE | re.IGNORECASE)
-    _check_counts(path, list(map(int, declared)), path.stat().st_size // _POINT_BYTES)
-
-
 def _check_counts(path: Path, counts: list[int], most: int) -> None:
+    """Refuses a file that declares more points or cells than fit into it."""
     for count in counts:
         if not 0 <= count <= most:
             size = path.stat().st_size
             raise DataError(f"{path}: it declares {count:,} points or cells but has {size:,} bytes. Is it complete?")
 
 
-def _check_xml(path: Path, parts: bool = True) -> None:
+def _check_xml(path: Path, is_part: bool = False) -> None:
     """Refuses an XML file that declares more than fits into it, or names files that are not in its folder.
 
     Its elements are parsed up to raw data, which end what is XML; parts that it names are checked, too.
     """
     check_regular(path)
-    check = _XmlCheck(path)
-    parser = expat.ParserCreate()
-    parser.StartElementHandler = check.start
-    parser.StartDoctypeDeclHandler = check.doctype
-    with path.open("rb") as file:
-        try:
-            while not check.raw and (block := file.read(_BLOCK_BYTES)):
-                parser.Parse(block, False)
-            if not check.raw:
-                parser.Parse(b"", True)
-        except expat.ExpatError as error:
-            if not check.raw:
-                raise DataError(f"{path}: cannot be read as VTK ({one_line(error)}). Is it complete?") from error
-    for part in check.parts:
-        check_within(path, part)
-        if not parts:
-            raise DataError(f"{path}: it is a part of another file, and names parts itself.")
-        _check_xml(part, parts=False)
+    limit, parts = expansion_limit(path.stat().st_size), list[Path]()
+    raw, tuples, declared = False, 0, 0
 
+    def doctype(*_: object) -> None:  # its entities would hide what is declared
+        raise DataError(f"{path}: cannot be read as VTK (it declares a document type).")
 
-class _XmlCheck:
-    """What the elements of an XML file declare, as far as they are parsed."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.limit = path, expansion_limit(path.stat().st_size)
-        self.parts: list[Path] = []
-        self.raw = False
-        self._tuples = self._bytes = 0
-
-    def doctype(self, *_: object) -> None:
-        """Refuses a document type, whose entities would hide what is declared."""
-        raise DataError(f"{self.path}: cannot be read as VTK (it declares a document type).")
-
-    def start(self, name: str, attributes: Mapping[str, str]) -> None:
-        """Checks an element."""
-        if self.raw:
+    def start(name: str, attributes: Mapping[str, str]) -> None:
+        nonlocal raw, tuples, declared
+        if raw:
             return
         kind = attributes.get("type", "nothing")
         if name == "VTKFile" and kind not in _KINDS:
-            raise _kind_error(self.path, kind)
-        self.raw = name == "AppendedData" and attributes.get("encoding", "raw") == "raw"
-        self.parts += [self.path.parent / value for key, value in attributes.items() if key.lower() in _REFERENCES]
-        numbers = {key: _number(value) for key, value in attributes.items() if key.startswith("NumberOf")}
+            raise _kind_error(path, kind)
+        raw = name == "AppendedData" and attributes.get("encoding", "raw") == "raw"
+        parts.extend(path.parent / value for key, value in attributes.items() if key.lower() in _REFERENCES)
+        numbers = dict[str, int]()  # those that texts begin with, as vtk reads them
+        for key, value in attributes.items():
+            if key.startswith("NumberOf"):
+                digits = re.match(r"\s*[-+]?\d{1,18}", value)
+                numbers[key] = int(digits[0]) if digits else 0
         components = numbers.pop("NumberOfComponents", 1)
-        _check_counts(self.path, [components, *numbers.values()], self.limit // _POINT_BYTES)
+        _check_counts(path, [components, *numbers.values()], limit // _POINT_BYTES)
         if name == "Piece":
-            self._tuples = max(numbers.values(), default=0)
+            tuples = max(numbers.values(), default=0)
         elif name.endswith("Array"):
             bits = re.search(r"\d+$", kind)
             size = int(bits[0]) // 8 if bits else 1
-            self._bytes += size * max(components, 1) * max(self._tuples, *numbers.values(), 0)
-            if self._bytes > self.limit:
-                raise DataError(f"{self.path}: it declares {self._bytes:,} bytes of arrays. Is it complete?")
+            declared += size * max(components, 1) * max(tuples, *numbers.values(), 0)
+            if declared > limit:
+                raise DataError(f"{path}: it declares {declared:,} bytes of arrays. Is it complete?")
 
-
-def _number(text: str) -> int:
-    """The integer that a text begins with, as vtk reads it; 0 if there is none."""
-    found = re.match(r"\s*[-+]?\d{1,18}", text)
-    return int(found[0]) if found else 0
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.StartDoctypeDeclHandler = start, doctype
+    with path.open("rb") as file:
+        try:
+            while not raw and (block := file.read(_BLOCK_BYTES)):
+                parser.Parse(block, False)
+            if not raw:
+                parser.Parse(b"", True)
+        except expat.ExpatError as error:
+            if not raw:
+                raise DataError(f"{path}: cannot be read as VTK ({one_line(error)}). Is it complete?") from error
+    for part in parts:
+        check_within(path, part)
+        if is_part:
+            raise DataError(f"{path}: it is a part of another file, and names parts itself.")
+        _check_xml(part, is_part=True)

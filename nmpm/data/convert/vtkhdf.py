@@ -75,7 +75,9 @@ def _steps(root: Any) -> Iterator[tuple[int, int, dict[str, int], float | None]]
     """Yields the number of points of each step, the index of the first, that of each array, and the time."""
     points = root["NumberOfPoints"][()]
     if "Steps" not in root:
-        yield int(points.sum()), 0, {}, _time(root)
+        stated = (each for name, each in root.get("FieldData", {}).items() if name.lower() in ("timevalue", "time"))
+        time = next((float(values[0]) for values in stated if values.shape == (1,)), None)
+        yield int(points.sum()), 0, {}, time
         return
     steps, number = root["Steps"], int(root["Steps"].attrs["NSteps"])
     if not 0 <= number <= min(len(steps["Values"]), len(steps["PartOffsets"])):
@@ -104,11 +106,3 @@ class _Rows:
             name = self._dataset.name.removeprefix(f"/{VTKHDF}/")
             raise DataError(f"{self._dataset.file.filename}: {count} rows of {name} from {first} on are not there.")
         return rows
-
-
-def _time(root: Any) -> float | None:
-    """The time that the field data state."""
-    for name, values in root.get("FieldData", {}).items():
-        if name.lower() in ("timevalue", "time") and values.shape == (1,):
-            return float(values[0])
-    return None

@@ -8,7 +8,7 @@ columns are a name or type, x, y, z, and velocities if there are three more.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import ClassVar
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from nmpm._support.messages import one_line
 from nmpm.data.convert.frames import Frame, wrap
 from nmpm.data.convert.named_arrays import AXES
-from nmpm.data.convert.text_frames import Lines, TextFrames, first_line, parse_columns
+from nmpm.data.convert.text_frames import Lines, TextFrames, parse_columns
 from nmpm.scene import Boundary, Interval
 
 _MOST_COLUMNS = 10_000
@@ -43,10 +43,20 @@ class Xyz(TextFrames):
 
     def frame(self, header: str, block: bytes) -> Frame:
         keys = {match[1].lower(): match[2] or match[3] or match[4] or "" for match in _KEY.finditer(header)}
-        width = len(first_line(block).split())
-        names = _columns(keys["properties"], width) if "properties" in keys else _plain_columns(width or 4)
+        width = len(block.partition(b"\n")[0].split())
+        if "properties" in keys:
+            names = _columns(keys["properties"], width)
+        else:
+            width = width or 4
+            rest = [("velocity", 3)] if width == 7 else [(f"column{index}", 1) for index in range(5, width + 1)]
+            names = [("type", 1), ("pos", max(1, min(width - 1, 3))), *rest]
         columns = parse_columns(block, [f"{name}/{part}" for name, width in names for part in range(width)])
-        arrays = {name: _join([columns[f"{name}/{part}"] for part in range(width)]) for name, width in names}
+        arrays: dict[str, np.ndarray] = {}  # (N,) or (N, k)
+        for name, width in names:
+            first, *others = (columns[f"{name}/{part}"] for part in range(width))
+            digits = first.dtype.kind == "U" and len(first) > 0 and np.char.isdigit(first).all()
+            single = first.astype(np.int64) if digits else first
+            arrays[name] = np.stack([first, *others], axis=1) if others else single
         position = arrays.pop("pos")
         if position.ndim != 2 or position.shape[1] > len(AXES) or position.dtype.kind != "f":
             raise ValueError("expected two or three columns of coordinates")
@@ -64,20 +74,6 @@ def _columns(properties: str, present: int) -> list[tuple[str, int]]:
     if 0 in widths or (sum(widths) != present and present) or sum(widths) > _MOST_COLUMNS:
         raise ValueError(f"Properties={one_line(properties, 60)} lists {sum(widths):,} columns, not {present}")
     return list(zip(words[::3], widths, strict=True))
-
-
-def _plain_columns(width: int) -> list[tuple[str, int]]:
-    """Names and widths of the columns of plain XYZ."""
-    rest = [("velocity", 3)] if width == 7 else [(f"column{index}", 1) for index in range(5, width + 1)]
-    return [("type", 1), ("pos", max(1, min(width - 1, 3))), *rest]
-
-
-def _join(columns: Sequence[np.ndarray]) -> np.ndarray:
-    """Columns as (N,) or (N, k); texts of digits become numbers."""
-    if len(columns) > 1:
-        return np.stack(columns, axis=1)
-    texts = columns[0].dtype.kind == "U" and len(columns[0]) > 0
-    return columns[0].astype(np.int64) if texts and np.char.isdigit(columns[0]).all() else columns[0]
 
 
 def _box(keys: dict[str, str]) -> tuple[tuple[Interval, ...] | None, tuple[Boundary, ...] | None]:

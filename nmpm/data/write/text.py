@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from nmpm._support.atomic import atomic_write
-from nmpm.data.format import ID, Metadata, Trajectory
+from nmpm.data.format import ID, Trajectory
 from nmpm.data.write.base import Clip, ClipFrame, TextWriter, TrajectoryWriter
 
 _AXES = "xyz"
@@ -69,7 +69,10 @@ class LammpsDump(TextWriter):
     readers: ClassVar[str] = "OVITO, VMD"
 
     def text(self, clip: Clip) -> Iterator[str]:
-        box, ids = _box(clip.metadata), clip.trajectory.ids(first=1)
+        thick = [(-0.5, 0.5)] * (3 - clip.metadata.dim)  # a plane is one unit thick, so that it has a volume
+        kinds = ["pp" if periodic else "ff" for periodic in clip.metadata.periodic] + ["pp"] * len(thick)
+        bounds = "".join(f"{low!r} {high!r}\n" for low, high in [*clip.metadata.bounds, *thick])
+        box, ids = f"ITEM: BOX BOUNDS {' '.join(kinds)}\n{bounds}", clip.trajectory.ids(first=1)
         for frame in clip.frames():
             named = columns(frame)
             yield (
@@ -77,14 +80,6 @@ class LammpsDump(TextWriter):
                 f"ITEM: NUMBER OF ATOMS\n{len(frame.index)}\n{box}ITEM: ATOMS id type {' '.join(named)}\n"
             )
             yield rows([ids[frame.number, frame.index], frame.particle_type, *named.values()], " ")
-
-
-def _box(metadata: Metadata) -> str:
-    """The box; a plane is one unit thick, so that it has a volume."""
-    thick = [(-0.5, 0.5)] * (3 - metadata.dim)
-    kinds = ["pp" if periodic else "ff" for periodic in metadata.periodic] + ["pp"] * len(thick)
-    lines = "".join(f"{low!r} {high!r}\n" for low, high in [*metadata.bounds, *thick])
-    return f"ITEM: BOX BOUNDS {' '.join(kinds)}\n{lines}"
 
 
 class Npz(TrajectoryWriter):

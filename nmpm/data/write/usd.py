@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from tempfile import TemporaryFile
 from typing import IO, ClassVar
 
@@ -26,13 +26,33 @@ class Usda(TextWriter):
     readers: ClassVar[str] = "Blender, Houdini, Omniverse"
 
     def text(self, clip: Clip) -> Iterator[str]:
-        codes = clip.times / clip.metadata.dt
+        trajectory, metadata = clip.trajectory, clip.metadata
+        codes, width = clip.times / metadata.dt, clip.spacing
+        names = {i: metadata.particle_types.get(i, f"type{i}") for i in np.unique(trajectory.particle_type).tolist()}
+        colours = material_colours(names.values())
         with ExitStack() as stack:
-            clouds = _clouds(clip, stack)
+            clouds = [
+                _Cloud(_identifier(name), i, i in metadata.static_types, colours[name], width, stack)
+                for i, name in names.items()
+            ]
+            clouds += [
+                replace(cloud, name=f"{TRUTH}_{cloud.name}", truth=True, samples={})
+                for cloud in clouds
+                if TRUTH in trajectory.fields and not cloud.static
+            ]
             for code, frame in zip(codes, clip.frames(), strict=True):
                 for cloud in clouds:
                     cloud.add(frame, code)
-            yield _head(codes, clip)
+            low, high = (tuple(pad(np.array([corner]))[0].tolist()) for corner in np.array(metadata.bounds).T)
+            gravity = np.abs(trajectory_gravity(trajectory.attributes, metadata, "trajectory") or (0.0, 0.0, 1.0))
+            up = "Z" if metadata.dim == 3 and int(np.argmax(gravity)) == 2 else "Y"
+            rate = f"{1 / metadata.dt:.9g}"
+            yield (
+                f'#usda 1.0\n(\n    defaultPrim = "particles"\n    upAxis = "{up}"\n    metersPerUnit = 1\n'
+                f"    timeCodesPerSecond = {rate}\n    framesPerSecond = {rate}\n"
+                f"    startTimeCode = {codes[0]:.9g}\n    endTimeCode = {codes[-1]:.9g}\n)\n\n"
+                f'def Xform "particles"\n{{\n    float3[] extentsHint = [{low}, {high}]\n'
+            )
             for cloud in clouds:
                 yield from cloud.lines()
             yield "}\n"
@@ -92,37 +112,6 @@ class _Cloud:
             part = TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115 (the stack closes it)
             self.samples[declared] = self.stack.enter_context(part)
         self.samples[declared].write(f"            {code:.9g}: {values},\n")
-
-
-def _clouds(clip: Clip, stack: ExitStack) -> list[_Cloud]:
-    trajectory, metadata = clip.trajectory, clip.metadata
-    types = np.unique(trajectory.particle_type).tolist()
-    names = {i: metadata.particle_types.get(i, f"type{i}") for i in types}
-    colours, width = material_colours(names.values()), clip.spacing
-    clouds = [
-        _Cloud(_identifier(name), i, i in metadata.static_types, colours[name], width, stack)
-        for i, name in names.items()
-    ]
-    truths = [
-        _Cloud(f"{TRUTH}_{cloud.name}", cloud.type_id, False, cloud.colour, width, stack, truth=True)
-        for cloud in clouds
-        if TRUTH in trajectory.fields and not cloud.static
-    ]
-    return clouds + truths
-
-
-def _head(codes: np.ndarray, clip: Clip) -> str:
-    metadata = clip.metadata
-    low, high = (pad(np.array([corner]))[0].tolist() for corner in np.array(metadata.bounds).T)
-    gravity = np.abs(trajectory_gravity(clip.trajectory.attributes, metadata, "trajectory") or (0.0, 0.0, 1.0))
-    up = "Z" if metadata.dim == 3 and int(np.argmax(gravity)) == 2 else "Y"
-    rate = f"{1 / metadata.dt:.9g}"
-    return (
-        f'#usda 1.0\n(\n    defaultPrim = "particles"\n    upAxis = "{up}"\n    metersPerUnit = 1\n'
-        f"    timeCodesPerSecond = {rate}\n    framesPerSecond = {rate}\n"
-        f"    startTimeCode = {codes[0]:.9g}\n    endTimeCode = {codes[-1]:.9g}\n)\n\n"
-        f'def Xform "particles"\n{{\n    float3[] extentsHint = [{tuple(low)}, {tuple(high)}]\n'
-    )
 
 
 def _list(values: np.ndarray) -> str:

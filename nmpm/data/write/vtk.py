@@ -91,14 +91,13 @@ def _times(trajectory: Any, frames: int) -> np.ndarray:
 def _blocks(trajectories: list[Any]) -> Iterator[_Block]:
     for trajectory in trajectories:
         number = "" if len(trajectories) == 1 else "_" + trajectory.name.strip("/")
-        has_truth = _is_like_position(trajectory.get(TRUTH), trajectory["position"].shape)
+        truth, shape = trajectory.get(TRUTH), trajectory["position"].shape
+        has_truth = (
+            isinstance(truth, h5py.Dataset) and truth.ndim == 3 and truth.shape[1:] == shape[1:] and truth.shape[0] > 0
+        )
         yield _Block(("prediction" if has_truth else "trajectory") + number, trajectory)
         if has_truth:
             yield _Block(TRUTH + number, trajectory, TRUTH)
-
-
-def _is_like_position(truth: Any, shape: tuple[int, ...]) -> bool:
-    return isinstance(truth, h5py.Dataset) and truth.ndim == 3 and truth.shape[1:] == shape[1:] and truth.shape[0] > 0
 
 
 def _ordered_group(parent: Any, name: str) -> Any:
@@ -128,7 +127,12 @@ def _write_block(group: Any, block: _Block, times: np.ndarray) -> None:
     for name in ("CellOffsets", "ConnectivityIdOffsets"):
         _write(steps, name, np.zeros((len(times), len(_CELLS))))
     _write(group, "NumberOfPoints", np.full(frames, particles))
-    _write_cells(group, frames, particles)
+    for name in _CELLS:  # a vertex for each point, the same in every frame
+        cells, count = group.create_group(name), particles if name == "Vertices" else 0
+        _write(cells, "Connectivity", np.arange(count))
+        _write(cells, "Offsets", np.arange(count + 1))
+        for total in ("NumberOfCells", "NumberOfConnectivityIds"):
+            _write(cells, total, np.full(frames, count))
     _map(group, "Points", position, 2, dim)
     data, offsets = group.create_group("PointData"), steps.create_group("PointDataOffsets")
     for name, values in block.trajectory.items():
@@ -147,16 +151,6 @@ def _point_axes(name: str, values: Any, frames: int, particles: int) -> int:
     if values.shape[:2] == (frames, particles):
         return 2
     return int(values.shape[0] == particles and values.ndim < 3)
-
-
-def _write_cells(group: Any, frames: int, particles: int) -> None:
-    """A vertex for each point; the same cells in every frame."""
-    for name in _CELLS:
-        cells, count = group.create_group(name), particles if name == "Vertices" else 0
-        _write(cells, "Connectivity", np.arange(count))
-        _write(cells, "Offsets", np.arange(count + 1))
-        for total in ("NumberOfCells", "NumberOfConnectivityIds"):
-            _write(cells, total, np.full(frames, count))
 
 
 def _write(group: Any, name: str, values: np.ndarray) -> None:
@@ -189,7 +183,14 @@ class NativeHdf5(TrajectoryWriter):
         return self.write_all(path, [clip])[0]
 
     def write_all(self, path: Path, clips: Iterable[Clip]) -> list[Path]:
-        write_viewable(path, self._described(clips))
+        def described() -> Iterator[Trajectory]:
+            for clip in clips:
+                trajectory, metadata = clip.trajectory, clip.metadata
+                scene = description(trajectory, metadata, clip.spacing**metadata.dim)
+                yield replace(trajectory, attributes=scene | trajectory.attributes, fields=self.fields(clip))
+                clip.step_all()
+
+        write_viewable(path, described())
         return [path]
 
     def paths(self, path: Path, count: int) -> list[Path]:  # noqa: ARG002
@@ -197,13 +198,6 @@ class NativeHdf5(TrajectoryWriter):
 
     def left_out(self, trajectory: Trajectory) -> set[str]:  # noqa: ARG002
         return set()
-
-    def _described(self, clips: Iterable[Clip]) -> Iterator[Trajectory]:
-        """The trajectories with attributes that describe their scene; steps once each is written."""
-        for clip in clips:
-            described = description(clip.trajectory, clip.metadata, clip.spacing**clip.metadata.dim)
-            yield replace(clip.trajectory, attributes=described | clip.trajectory.attributes, fields=self.fields(clip))
-            clip.step_all()
 
     def fields(self, clip: Clip) -> dict[str, np.ndarray]:
         """The fields to write."""

@@ -1,10 +1,12 @@
-"""Arrays under usual names, as people save them."""
+"""Arrays under usual names, as people save them: runs in a file, also MATLAB's, and a file or a group per frame."""
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+import scipy.io
 
 from nmpm.data.convert import Options, convert, open_dataset
 from nmpm.data.format import Split, read_metadata
@@ -265,3 +267,161 @@ def test_texts_in_archives_are_types_or_left_out_or_refused_with_the_mend(tmp_pa
     np.savez(tmp_path / "b.npz", position=made(), types=names.astype(object))
     with pytest.raises(DataError, match=r"b\.npz: types: holds Python objects.* texts by \.astype\(str\)"):
         read(tmp_path / "b.npz")
+
+
+def write_v73(path: Path, arrays: dict, cells: dict) -> None:
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in arrays.items():
+            file[name] = np.atleast_2d(np.asarray(values, float)).T
+        for name, runs in cells.items():
+            inside = [file.create_dataset(f"#refs#/{chr(97 + i)}", data=run.T).ref for i, run in enumerate(runs)]
+            file.create_dataset(name, data=np.array([inside], h5py.ref_dtype).T, dtype=h5py.ref_dtype)
+        file["note"] = np.frombuffer("mm".encode("utf-16-le"), np.uint16)[:, None]
+        file["note"].attrs["MATLAB_class"] = np.bytes_("char")
+
+
+@pytest.mark.parametrize("old", [True, False])
+def test_arrays_structs_and_cells_are_read(tmp_path, old):
+    runs, facts = [made(seed) for seed in range(4)], {"dt": 0.02, "types": np.array([[1.0], [1], [2], [2], [2]])}
+    for name, content in (("one", {"position": runs[0]}), ("many", {})):
+        path, cells = tmp_path / f"{name}.mat", {} if content else {"runs": runs}
+        if old:
+            cell = np.empty((1, len(runs)), object)
+            cell[0] = [*runs]
+            scipy.io.savemat(path, {**content, **facts, "note": "mm", **({} if content else {"runs": cell})})
+        else:
+            write_v73(path, {**content, **facts}, cells)
+        dataset = open_dataset(path)
+        read = [
+            run for split in ("train", "valid", "test") if split in dataset.splits for run in dataset.splits[split]()
+        ]
+        assert (len(read), dataset.metadata.dt) == (1 if content else 4, 0.02)
+        for run, expected in zip(read, runs, strict=False):
+            np.testing.assert_allclose(run.position, expected, rtol=1e-6)
+            assert run.particle_type.tolist() == [1, 1, 2, 2, 2]
+
+
+def test_damaged_files_are_named(tmp_path):
+    scipy.io.savemat(tmp_path / "a.mat", {"position": made(0)}, do_compression=True)
+    content = bytearray((tmp_path / "a.mat").read_bytes())
+    content[200:] = bytes(len(content) - 200)
+    (tmp_path / "a.mat").write_bytes(content)
+    with pytest.raises(DataError, match=r"a\.mat: cannot be read as a MATLAB file"):
+        open_dataset(tmp_path / "a.mat")
+
+
+T, N = 12, 6
+RUN = np.random.default_rng(0).random((T, N, 3)).round(5)
+WALL = np.random.default_rng(1).random((1, 3, 3)).repeat(T, axis=0)
+
+
+def npy(path: Path, t: int) -> None:
+    np.save(path / f"frame_{t:04}.npy", RUN[t])
+
+
+def npz(path: Path, t: int) -> None:
+    """As GeoTaichi."""
+    np.savez(
+        path / f"MPMParticle{t:06}.npz",
+        t_current=np.array([0.01 * t]),
+        position=RUN[t],
+        velocity=RUN[t],
+        volume=RUN[t, :, 0],
+    )
+
+
+def one_frame_of_one_run(path: Path, t: int) -> None:
+    np.savez(path / f"{t}.npz", positions=RUN[t : t + 1], time=0.01 * t)
+
+
+def components(path: Path, t: int) -> None:
+    """As PySPH."""
+    with h5py.File(path / f"dam_{100 * t}.hdf5", "w") as file:
+        file.create_group("solver_data").attrs.update({"t": 0.01 * t, "dt": 1e-4, "count": 100 * t})
+        arrays = {name: RUN[t, :, axis] for axis, name in enumerate("xyz")}
+        file.update({f"particles/fluid/arrays/{name}": array for name, array in arrays.items()})
+        file.update({f"particles/fluid/arrays/{name}": RUN[t, :, 0] for name in "uvw"})
+
+
+def table(path: Path, t: int) -> None:
+    """As CB-Geo."""
+    names = ["coord_x", "coord_y", "coord_z", "velocity_x", "velocity_y", "velocity_z"]
+    rows = np.zeros(N, [("id", "i8"), *((name, "f8") for name in names)])
+    order = np.random.default_rng(t).permutation(N)
+    rows["id"] = order
+    for axis in range(3):
+        rows[names[axis]] = rows[names[axis + 3]] = RUN[t, order, axis]
+    with h5py.File(path / f"particles{t:02}.h5", "w") as file:
+        file["table"] = rows
+
+
+@pytest.mark.parametrize("write", [npy, npz, one_frame_of_one_run, components, table], ids=lambda write: write.__name__)
+def test_a_file_per_frame(tmp_path: Path, write: Callable[[Path, int], None]) -> None:
+    (tmp_path / "data" / "run").mkdir(parents=True)
+    for t in range(T):
+        write(tmp_path / "data" / "run", t)
+    convert(tmp_path / "data", tmp_path / "out")
+    trajectory = Split(tmp_path / "out" / "train.h5").read_with_fields(0)
+    np.testing.assert_array_equal(trajectory.position, RUN.astype("f4"))
+    assert ("velocity" in trajectory.fields) == (write in (npz, components, table))
+    if "time" in trajectory.fields:
+        np.testing.assert_allclose(trajectory.fields["time"], 0.01 * np.arange(T))
+        assert read_metadata(tmp_path / "out").dt == pytest.approx(0.01)
+
+
+def groups(file: Path) -> None:
+    with h5py.File(file, "w") as content:
+        for t in reversed(range(T)):
+            content[f"frame_{t}/pos"] = RUN[t]
+            content[f"frame_{t}"].attrs["time"] = 0.01 * t
+
+
+def h5part(file: Path) -> None:
+    with h5py.File(file, "w") as content:
+        for t in range(T):
+            content.update({f"Step#{t}/{name}": RUN[t, :, axis] for axis, name in enumerate("xyz")})
+
+
+def unnamed(file: Path) -> None:
+    np.savez(file.with_suffix(".npz"), *RUN)
+
+
+@pytest.mark.parametrize("write", [groups, h5part, unnamed], ids=lambda write: write.__name__)
+def test_many_frames_in_a_file(tmp_path: Path, write: Callable[[Path], None]) -> None:
+    (tmp_path / "data").mkdir()
+    write(tmp_path / "data" / "run.h5")
+    convert(tmp_path / "data", tmp_path / "out")
+    np.testing.assert_array_equal(Split(tmp_path / "out" / "train.h5").read(0).position, RUN.astype("f4"))
+
+
+def save(path: Path, content: Mapping[str, np.ndarray]) -> None:
+    with h5py.File(path, "w") as file:
+        file.update(content)
+
+
+def test_groups_are_materials_and_grids_are_none(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    for t in range(T):
+        ids = {"particles/fluid/id": np.arange(N), "particles/wall/id": np.arange(3)}
+        positions = {"particles/fluid/x": RUN[t], "particles/wall/x": WALL[t], "grid/position": np.zeros((9, 3))}
+        save(tmp_path / "data" / f"out_{t}.h5", ids | positions)
+    convert(tmp_path / "data", tmp_path / "out")
+    trajectory, metadata = Split(tmp_path / "out" / "train.h5").read(0), read_metadata(tmp_path / "out")
+    assert metadata.particle_types == {0: "fluid", 1: "wall"}
+    assert metadata.static_types == {1}
+    np.testing.assert_array_equal(trajectory.particle_type, [0] * N + [1] * 3)
+    np.testing.assert_array_equal(trajectory.position, np.concatenate([RUN, WALL], axis=1).astype("f4"))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"positions": RUN[0]}, r"this is one frame.*np\.stack\(frames\)"),
+        ({"x": RUN[0, :, 0], "y": RUN[0, :-1, 1]}, r"positions are \(T, N, D\)"),
+    ],
+    ids=["alone", "lengths"],
+)
+def test_one_frame_is_no_run(tmp_path: Path, content: Mapping[str, np.ndarray], message: str) -> None:
+    save(tmp_path / "a.h5", content)
+    with pytest.raises(DataError, match=message):
+        open_dataset(tmp_path / "a.h5")

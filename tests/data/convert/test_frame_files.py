@@ -147,19 +147,6 @@ def test_vectors_become_velocities_or_fields_per_component(tmp_path):
     assert len(fields) == 1 + 3 + 6
 
 
-@pytest.mark.parametrize("axis", [1, 2])
-def test_an_axis_without_extent_is_left_out(tmp_path, axis):
-    position = positions()
-    position[..., axis] = 0.25
-    frames = [frame_text(p, "pos:R:3:vel:R:3", vel=p) for p in position]
-    notes = convert(write_frames(tmp_path / "run.xyz", *frames), tmp_path / "out")
-    trajectory = Split(tmp_path / "out" / "train.h5").read_with_fields(0)
-    flat = np.delete(position, axis, axis=2).astype("f4")
-    np.testing.assert_array_equal(trajectory.position, flat)
-    np.testing.assert_array_equal(trajectory.fields["velocity"], flat)
-    assert any(f"{'xyz'[axis]} is 0.25 everywhere" in note for note in notes)
-
-
 def test_times_and_an_array_that_some_frames_lack(tmp_path, caplog):
     frames = [frame_text(p, comment=f"Time={0.5 * t}") for t, p in enumerate(positions())]
     frames[:2] = [
@@ -172,34 +159,51 @@ def test_times_and_an_array_that_some_frames_lack(tmp_path, caplog):
     assert "frame 2: the array 'heat' is not in all frames" in caplog.text
 
 
-TWO = [[0, 0, 0], [1, 1, 1]]
-ONE_MORE = [*TWO, [0.5, 0.5, 0.6]]
+TWO = np.array([[0, 0, 0], [1, 1, 1]])
+FIRST = frame_text(TWO)
+WITH_IDS = frame_text(TWO, "pos:R:3:id:I:1", id=[1, 2])
+FLAT = positions(20) * [1, 1, 0]
+
+
+def of_types(*types: int) -> str:
+    return frame_text(TWO, "pos:R:3:id:I:1:material:I:1", id=[7, 9], material=types)
 
 
 @pytest.mark.parametrize(
-    ("second", "message"),
+    ("frames", "message"),
     [
-        (frame_text(np.array(ONE_MORE), "pos:R:3"), "frame 1: 3 particles, but 2 in .*frame 0. .*id array"),
-        (frame_text(np.array(TWO), "pos:R:3:type:I:1", id=[1, 2]), "frame 1: only some frames have types"),
-        (frame_text(np.array([[0, 0, np.inf], [1, 1, 1]])), r"frame 1: position of particle 0 is \[0.0, 0.0, inf\]"),
-        (frame_text(np.array(TWO)[:, :2], "pos:R:2"), "frame 1: 2 axes, unlike the first frame"),
-        ("2\nsomething\n1 0 0\n", "ends at line 7, within a frame; its first 4 lines are complete frames"),
-        ("many\n", "line 5 is 'many'; expected the number of particles"),
-        ("2\nProperties=where:R:3\n0 0 0\n1 1 1\n", "Properties=where:R:3 does not list names, kinds and widths, or"),
-        ("2\nProperties=pos:R:3\n0 0 0\n1 1\n", "frame 1: .*column"),
+        ([FIRST, frame_text(positions(1, particles=3)[0])], "frame 1: 3 particles, but 2 in .*frame 0. .*id array"),
+        ([FIRST, frame_text(TWO, "pos:R:3:type:I:1", id=[1, 2])], "frame 1: only some frames have types"),
+        ([WITH_IDS, FIRST], "frame 1: only some frames have ids"),
+        (
+            [of_types(1, 2), of_types(1, 2), of_types(1, 3)],
+            "frame 2: particle with id 9 has type 3, but 2 in frames before",
+        ),
+        (
+            [FIRST, frame_text(np.where(TWO, 1, [0, 0, np.inf]))],
+            r"frame 1: position of particle 0 is \[0.0, 0.0, inf\]",
+        ),
+        ([FIRST, frame_text(TWO[:, :2], "pos:R:2")], "frame 1: 2 axes, unlike the first frame"),
+        (
+            [*map(frame_text, FLAT[:15]), *map(frame_text, positions(5))],
+            r"frame 15: z = .*, but 0 for all particles of the first frames",
+        ),
+        ([FIRST, "2\nsomething\n1 0 0\n"], "ends at line 7, within a frame; its first 4 lines are complete frames"),
+        ([FIRST, "many\n"], "line 5 is 'many'; expected the number of particles"),
+        (
+            [FIRST, "2\nProperties=where:R:3\n0 0 0\n1 1 1\n"],
+            "Properties=where:R:3 does not list names, kinds and widths, or",
+        ),
+        ([FIRST, "2\nProperties=pos:R:3\n0 0 0\n1 1\n"], "frame 1: .*column"),
     ],
-    ids=["number", "types", "infinite", "axes", "cut", "no number", "no positions", "columns"],
-)
-def test_frames_that_do_not_fit_are_named(tmp_path, second, message):
-    write_frames(tmp_path / "run.xyz", frame_text(np.array(TWO)), second)
+    ids=[
+        "number", "types", "ids", "a type that changes", "infinite", "axes", "plane", "cut", "no number",
+        "no positions", "columns",
+    ],
+)  # fmt: skip
+def test_frames_that_do_not_fit_are_named(tmp_path, frames, message):
     with pytest.raises(DataError, match=f"run.xyz.*{message}"):
-        convert(tmp_path / "run.xyz", tmp_path / "out")
-
-
-def test_ids_in_some_frames_only_are_refused(tmp_path):
-    first = frame_text(np.array(TWO), "pos:R:3:id:I:1", id=[1, 2])
-    with pytest.raises(DataError, match="frame 1: only some frames have ids"):
-        convert(write_frames(tmp_path / "run.xyz", first, frame_text(np.array(TWO))), tmp_path / "out")
+        convert(write_frames(tmp_path / "run.xyz", *frames), tmp_path / "out")
 
 
 def test_equal_ids_in_the_first_frame_are_no_ids(tmp_path):
@@ -225,60 +229,30 @@ def test_one_type_with_a_name(tmp_path):
     assert read_metadata(tmp_path / "out").particle_types == {0: "honey"}
 
 
-def test_a_type_that_changes_is_named(tmp_path):
-    types = [[1, 2], [1, 2], [1, 3]]
-    frames = [frame_text(np.array(TWO), "pos:R:3:id:I:1:material:I:1", id=[7, 9], material=each) for each in types]
-    with pytest.raises(DataError, match=r"frame 2: particle with id 9 has type 3, but 2 in frames before"):
-        convert(write_frames(tmp_path / "run.xyz", *frames), tmp_path / "out")
-
-
-def test_a_plane_that_is_left_late_is_named(tmp_path):
-    position = positions(20)
-    position[:15, :, 2] = 0
-    with pytest.raises(DataError, match=r"frame 15: z = .*, but 0 for all particles of the first frames"):
-        convert(write_frames(tmp_path / "run.xyz", *map(frame_text, position)), tmp_path / "out")
-
-
-def add_other_series(run: Path) -> None:
-    for number in range(T):
-        (run / f"other_{number}.xyz").write_text(frame_text(positions()[0]))
-
-
-def empty_all(run: Path) -> None:
-    for file in [*run.iterdir(), run / "mesh_0.xyz"]:
-        file.write_text("")
-
-
-def empty_the_last(run: Path) -> None:
-    (run / f"frame_{T - 1}.xyz").write_text("")
-
-
-def cut_in_the_middle(run: Path) -> None:
-    (run / "frame_5.xyz").write_text((run / "frame_5.xyz").read_text()[:-20])
-
-
-def append_a_frame(run: Path) -> None:
-    (run / "frame_5.xyz").write_text(2 * (run / "frame_5.xyz").read_text())
-
-
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    ("files", "change", "message"),
     [
         (
-            add_other_series,
+            [f"other_{t}.xyz" for t in range(T)],
+            lambda _: frame_text(positions()[0]),
             r"run: files of 2 kinds may be the particles: frame_\*.xyz \(12\), other_\*.xyz \(12\)\. State which:"
             r" --files 'frame_\*.xyz'; kinds .* --files 'frame_\*.xyz,other_\*.xyz', join.* a folder of its own",
         ),
-        (empty_all, r"run: no file in it has particles: frame_\*.xyz \(no frame\), mesh_\*.xyz \(no frame\)"),
-        (empty_the_last, r"frame_11.xyz: there is no frame in it"),
-        (cut_in_the_middle, "frame_5.xyz: cannot be read as XYZ"),
-        (append_a_frame, "frame_5.xyz: there is more than one frame in it, but one in the first file"),
+        (
+            [*(f"frame_{t}.xyz" for t in range(T)), "mesh_0.xyz"],
+            lambda _: "",
+            r"run: no file in it has particles: frame_\*.xyz \(no frame\), mesh_\*.xyz \(no frame\)",
+        ),
+        ([f"frame_{T - 1}.xyz"], lambda _: "", r"frame_11.xyz: there is no frame in it"),
+        (["frame_5.xyz"], lambda content: content[:-20], "frame_5.xyz: cannot be read as XYZ"),
+        (["frame_5.xyz"], lambda content: 2 * content, "frame_5.xyz: there is more than one frame in it, but one"),
     ],
     ids=["series", "no particles", "empty", "cut", "many"],
 )
-def test_wrong_files_are_named(tmp_path, damage, message):
+def test_wrong_files_are_named(tmp_path, files, change, message):
     write_run(tmp_path / "run")
-    damage(tmp_path / "run")
+    for file in (tmp_path / "run" / name for name in files):
+        file.write_text(change(file.read_text() if file.exists() else ""))
     with pytest.raises(DataError, match=message):
         convert(tmp_path / "run", tmp_path / "out")
 

@@ -16,7 +16,7 @@ from nmpm.data.convert import Options, convert, open_dataset
 from nmpm.data.convert.pickles import load_pickled
 from nmpm.data.format import Split, read_metadata
 from nmpm.errors import DataError
-from tests.data.convert import records
+from tests.data.convert import records, writers
 from tests.data.convert.test_dmcf import frames, packed, write
 
 msgpack = pytest.importorskip("msgpack", reason="the extra `convert` is not installed")
@@ -193,15 +193,9 @@ def test_text_that_declares_much(tmp_path, name, content):
 
 
 def write_vtkhdf(path, change):
-    with h5py.File(path, "w") as file:
-        root = file.create_group("VTKHDF")
-        root.attrs["Type"], root.attrs["Version"] = np.bytes_("PolyData"), [2, 2]
-        root["NumberOfPoints"], root["Points"] = np.full(4, 5), np.random.default_rng(0).random((20, 3))
-        root["PointData/id"] = np.tile(np.arange(5), 4)
-        steps = root.create_group("Steps")
-        steps.attrs["NSteps"], steps["Values"], steps["PartOffsets"] = 4, np.arange(4.0), np.arange(4)
-        steps["PointOffsets"], steps["PointDataOffsets/id"] = 5 * np.arange(4), 5 * np.arange(4)
-        change(root)
+    writers.write_vtkhdf(path, np.random.default_rng(0).random((4, 5, 3)), {"id": np.arange(5)})
+    with h5py.File(path, "a") as file:
+        change(file["VTKHDF"])
     return path
 
 

@@ -16,9 +16,10 @@ from nmpm.cli import main
 from nmpm.data.convert import open_dataset
 from nmpm.data.format import Trajectory
 from nmpm.errors import DataError
+from tests.data.convert.test_array_files import RUN, N, T, components
+from tests.data.convert.test_array_files import h5part as steps_of_h5part
+from tests.data.convert.writers import write_lammps
 
-T, N = 12, 6
-RUN = np.random.default_rng(0).random((T, N, 3)).round(5)
 WALL = np.random.default_rng(1).random((4, 3)).round(5)
 Writer = Callable[[Path], None]
 
@@ -78,13 +79,13 @@ def liggghts(folder: Path) -> None:
 
 
 def lammps(name: str) -> Writer:
-    box = "ITEM: BOX BOUNDS ff ff ff\n" + "0 1\n" * 3
+    def write(folder: Path) -> None:
+        for t in range(T):
+            file = folder / name.format(t)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_lammps(file, RUN[t : t + 1], {"id": np.arange(N)})
 
-    def frame(t: int) -> str:
-        rows = "".join(f"{i + 1} {x} {y} {z}\n" for i, (x, y, z) in enumerate(RUN[t].tolist()))
-        return f"ITEM: TIMESTEP\n{t}\nITEM: NUMBER OF ATOMS\n{N}\n{box}ITEM: ATOMS id x y z\n{rows}"
-
-    return lambda folder: text(folder, name, frame)
+    return write
 
 
 def tecplot(folder: Path) -> None:
@@ -105,10 +106,7 @@ def geotaichi(folder: Path) -> None:
 def pysph(folder: Path) -> None:
     folder.mkdir()
     for t in range(T):
-        with h5py.File(folder / f"dam_{100 * t}.hdf5", "w") as file:
-            file.create_group("solver_data").attrs["t"] = 0.01 * t
-            for axis, name in enumerate("xyz"):
-                file[f"particles/fluid/arrays/{name}"] = RUN[t, :, axis]
+        components(folder, t)
 
 
 def edem(folder: Path) -> None:
@@ -129,10 +127,7 @@ def swift(folder: Path) -> None:
 
 def h5part(folder: Path) -> None:
     folder.mkdir()
-    with h5py.File(folder / "run.h5", "w") as file:
-        for t in range(T):
-            file.create_group(f"Step#{t}").attrs["time"] = 0.01 * t
-            file.update({f"Step#{t}/{name}": RUN[t, :, axis] for axis, name in enumerate("xyz")})
+    steps_of_h5part(folder / "run.h5")
 
 
 def h5md(folder: Path) -> None:
@@ -157,7 +152,7 @@ def paraview(folder: Path) -> None:
         (dualsphysics_csv, False), (lammps("dump.{}"), False), (lammps("dump{}.liggghts"), False), (tecplot, False),
         (geotaichi, False), (pysph, False), (edem, False), (swift, False), (h5part, False), (h5md, False),
     ],
-    ids=lambda value: getattr(value, "__name__", "").replace("<lambda>", "lammps"),
+    ids=lambda value: getattr(value, "__name__", "").replace("write", "lammps"),
 )  # fmt: skip
 def test_what_programs_write_is_read(tmp_path: Path, write: Writer, needs_vtk: bool) -> None:
     if needs_vtk:

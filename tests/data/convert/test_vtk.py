@@ -1,4 +1,4 @@
-"""Files that vtk writes, by pyvista."""
+"""Files that vtk writes, by pyvista, and PLY files that plyfile writes."""
 
 import json
 from pathlib import Path
@@ -11,6 +11,7 @@ from nmpm.data.format import Split, read_metadata
 from nmpm.errors import DataError
 
 pyvista = pytest.importorskip("pyvista", reason="the extra `vtk` is not installed")
+plyfile = pytest.importorskip("plyfile", reason="the extra `vtk` is not installed")
 
 T, N = 5, 7
 
@@ -30,14 +31,28 @@ def write_run(folder: Path, suffix: str = ".vtp", binary: bool = True) -> np.nda
     folder.mkdir(parents=True)
     position = positions()
     for t, frame in enumerate(position):
-        mesh = cloud(frame, velocity=2 * frame, pressure=frame[:, 0].astype("f8"), type=np.arange(N) % 2)
+        arrays = {"velocity": 2 * frame, "pressure": frame[:, 0].astype("f8"), "type": np.arange(N, dtype="u1") % 2}
+        if suffix == ".ply":
+            names = ("x", "y", "z", "vx", "vy", "vz")
+            vertices = np.zeros(N, [*((name, "f4") for name in names), ("pressure", "f8"), ("type", "u1")])
+            for name, values in zip(names, np.concatenate([frame, arrays.pop("velocity")], axis=1).T, strict=True):
+                vertices[name] = values
+            for name, values in arrays.items():
+                vertices[name] = values
+            element = plyfile.PlyElement.describe(vertices, "vertex")
+            plyfile.PlyData([element], text=not binary, comments=[f"time {0.5 * t}"]).write(folder / f"frame_{t}.ply")
+            continue
+        mesh = cloud(frame, **arrays)
         mesh.field_data["TimeValue"] = [0.5 * t]
         mesh = mesh.cast_to_unstructured_grid() if suffix == ".vtu" else mesh
         mesh.save(folder / f"frame_{t}{suffix}", binary=binary)
     return position
 
 
-@pytest.mark.parametrize(("suffix", "binary"), [(".vtk", True), (".vtk", False), (".vtp", True), (".vtu", True)])
+@pytest.mark.parametrize(
+    ("suffix", "binary"),
+    [(".vtk", True), (".vtk", False), (".vtp", True), (".vtu", True), (".ply", True), (".ply", False)],
+)
 def test_points_arrays_and_times_are_read(tmp_path, suffix, binary):
     position = write_run(tmp_path / "data" / "train" / "run0", suffix, binary)
     convert(tmp_path / "data", tmp_path / "out")
@@ -81,8 +96,16 @@ def replace_by_grid(path: Path) -> None:
 
 
 def declare_more(path: Path) -> None:
-    for few, many in ((b"POINTS 7", b"POINTS 700000000"), (b'OfPoints="7"', b'OfPoints="700000000"')):
+    for few, many in (
+        (b"POINTS 7", b"POINTS 700000000"),
+        (b'OfPoints="7"', b'OfPoints="700000000"'),
+        (b"vertex 7", b"vertex 7000000000"),
+    ):
         path.write_bytes(path.read_bytes().replace(few, many))
+
+
+def rename_axes(path: Path) -> None:
+    path.write_bytes(path.read_bytes().replace(b"float x", b"float q").replace(b"float y", b"float r"))
 
 
 def declare_fewer_than_none(path: Path) -> None:
@@ -106,8 +129,24 @@ def test_a_series_that_is_none_is_named(tmp_path, content):
         (".vtk", declare_more, "it declares 700,000,000 points or cells but has"),
         (".vtp", declare_more, "it declares 700,000,000 points or cells but has"),
         (".vtu", declare_fewer_than_none, "it declares -7 points or cells but has"),
+        (".ply", cut, r"cannot be read as PLY \(.*early end-of-file"),
+        (".ply", rename_axes, r"it has no element vertex with x, y \(found: vertex, q, r, z"),
+        (".ply", declare_more, "cannot be read as PLY"),
+        (".ply", lambda path: path.write_bytes(b""), "cannot be read as PLY "),
     ],
-    ids=["vtp", "vtk", "empty", "grid", "size", "XML size", "negative"],
+    ids=[
+        "vtp",
+        "vtk",
+        "empty",
+        "grid",
+        "size",
+        "XML size",
+        "negative",
+        "ply",
+        "ply axes",
+        "ply size",
+        "empty ply",
+    ],
 )
 @pytest.mark.parametrize("frame", [1, T - 1])
 def test_damaged_files_are_named(tmp_path, capfd, suffix, damage, message, frame):

@@ -1,4 +1,4 @@
-"""H5MD files, as the programs that write it lay them out."""
+"""HDF5 of many frames: H5MD, as the programs that write it lay it out; VTKHDF that vtk and this project write."""
 
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from nmpm.data.convert import convert, open_dataset
-from nmpm.data.format import Split, read_metadata
+from nmpm.data.format import Split, Trajectory, read_metadata
+from nmpm.data.write.vtk import write_viewable
 from nmpm.errors import DataError
 
 T, N = 8, 5
@@ -115,3 +116,83 @@ def test_what_cannot_be_read_is_named(tmp_path, position, edges, message):
     write(tmp_path / "run.h5", {"all": {"position": (position, STEPS)}}, "periodic", edges)
     with pytest.raises(DataError, match=message):
         convert(tmp_path / "run.h5", tmp_path / "out", "h5md")
+
+
+def write_by_vtk(data: object, path: Path) -> None:
+    pytest.importorskip("pyvista", reason="the extra `vtk` is not installed")
+    from vtkmodules.vtkIOHDF import vtkHDFWriter
+
+    writer = vtkHDFWriter()
+    writer.SetInputData(data)
+    writer.SetFileName(str(path))
+    writer.Write()
+
+
+@pytest.mark.parametrize("kind", ["PolyData", "UnstructuredGrid"])
+def test_a_file_per_frame(tmp_path, kind):
+    pyvista = pytest.importorskip("pyvista", reason="the extra `vtk` is not installed")
+    (tmp_path / "run").mkdir()
+    for t, frame in enumerate(RUN.astype("f4")):
+        points = pyvista.PolyData(frame)
+        points["velocity"], points["material"] = 3 * frame, np.arange(N) % 2
+        points.field_data["TimeValue"] = [0.1 * t]
+        write_by_vtk(points if kind == "PolyData" else points.cast_to_unstructured_grid(), tmp_path / f"run/{t}.vtkhdf")
+    convert(tmp_path / "run", tmp_path / "out")
+    trajectory = Split(tmp_path / "out" / "train.h5").read_with_fields(0)
+    np.testing.assert_array_equal(trajectory.position, RUN.astype("f4"))
+    np.testing.assert_array_equal(trajectory.fields["velocity"], 3 * RUN.astype("f4"))
+    assert trajectory.particle_type.tolist() == (np.arange(N) % 2).tolist()
+    assert trajectory.fields["time"] == pytest.approx(0.1 * np.arange(T))
+
+
+def own_file(path: Path, dim: int = 2) -> Trajectory:
+    """A particle that is absent for a while, a number per particle."""
+    position = RUN[..., :dim].astype("f4")
+    position[1:3, 2] = np.nan
+    fields = {"velocity": 2 * RUN[..., :dim].astype("f4"), "mass": np.arange(N) + 0.5, "time": 0.25 * np.arange(T)}
+    trajectory = Trajectory(position, np.arange(N) % 3, {}, fields)
+    write_viewable(path, [trajectory])
+    return trajectory
+
+
+def test_time_steps_in_a_file_that_this_project_writes(tmp_path):
+    written = own_file(tmp_path / "run.vtkhdf")
+    convert(tmp_path / "run.vtkhdf", tmp_path / "out")
+    trajectory = Split(tmp_path / "out" / "train.h5").read_with_fields(0)
+    np.testing.assert_array_equal(trajectory.position, written.position)
+    np.testing.assert_array_equal(trajectory.fields["mass"], written.fields["mass"])
+    there = ~np.isnan(written.position)
+    np.testing.assert_array_equal(trajectory.fields["velocity"][there], written.fields["velocity"][there])
+    assert trajectory.particle_type.tolist() == written.particle_type.tolist()
+    assert read_metadata(tmp_path / "out").dt == 0.25
+
+
+def link_elsewhere(file: h5py.File) -> None:
+    file["VTKHDF/more"] = h5py.ExternalLink("other.h5", "/")
+
+
+def declare_more_points(file: h5py.File) -> None:
+    file["VTKHDF/NumberOfPoints"][-1] = 10 * N
+
+
+def change_type(file: h5py.File) -> None:
+    file["VTKHDF"].attrs["Type"] = np.bytes_(b"ImageData")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (link_elsewhere, "'VTKHDF/more' is an external link to 'other.h5'"),
+        (declare_more_points, f"{10 * N} rows of Points from {(T - 1) * N} on are not there"),
+        (change_type, "it has a ImageData; particles are points, as PolyData or UnstructuredGrid"),
+        (lambda file: file.__delitem__("VTKHDF"), "there is no group VTKHDF in it"),
+        (lambda file: file.__delitem__("VTKHDF/Points"), "cannot be read as HDF5"),
+    ],
+    ids=["link", "points", "type", "group", "missing"],
+)
+def test_wrong_files_are_named(tmp_path, damage, message):
+    own_file(tmp_path / "run.vtkhdf", 3)
+    with h5py.File(tmp_path / "run.vtkhdf", "a") as file:
+        damage(file)
+    with pytest.raises(DataError, match=f"run.vtkhdf: {message}"):
+        convert(tmp_path / "run.vtkhdf", tmp_path / "out")
