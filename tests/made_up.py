@@ -1,8 +1,14 @@
 """Tiny trajectories that nothing simulated, and their metadata."""
 
+from pathlib import Path
+
 import numpy as np
 
+from nmpm.data.batches import TrajectoryBuffer, WindowPlan
+from nmpm.data.convert import Options
 from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.recordings import SplitRecordings
+from nmpm.data.sources import FolderSource
 
 
 def made_up_trajectory(
@@ -35,3 +41,15 @@ def made_up_metadata(dim: int = 2, **changes: object) -> Metadata:
         "gravity": (0.0,) * (dim - 1) + (-9.81,),
     }
     return Metadata(**(known | changes))
+
+
+def recordings_of(folder: Path, split: str = "train", **stated: object) -> SplitRecordings:
+    """The recordings of a dataset's split, of which a user states some facts."""
+    return FolderSource(folder, Options(**stated)).recordings(split)
+
+
+def buffer_of(folder: Path, **options: object) -> TrajectoryBuffer:
+    """Batches of four windows of five frames, from two of the training trajectories at a time."""
+    recordings = recordings_of(folder)
+    known = {"length": 5, "batch_size": 4, "buffer_size": 2, "passes": 1.0, "seed": 0}
+    return TrajectoryBuffer(recordings, WindowPlan(frames=recordings.frames, **(known | options)))

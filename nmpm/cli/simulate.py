@@ -89,7 +89,7 @@ class Simulate(Command):
         if self.preview is not None:
             _check_preview(self.preview)
         from nmpm.data import catalog
-        from nmpm.data.simulation import Shard, generate, generate_shard
+        from nmpm.data.simulation import Shard, generate
         from nmpm.sim import load_preset, preset_names
 
         shard = None if self.shard is None else Shard.parse(self.shard)
@@ -102,9 +102,7 @@ class Simulate(Command):
         counts |= {split: getattr(self, split) for split in counts if getattr(self, split) is not None}
         out = self.out or Path(preset.name)
         check_folder("--out", out)
-        if shard is None:
-            generate(preset, out, counts, self.seed, self.workers)
-        elif missing := generate_shard(preset, out, counts, shard, self.seed, self.workers):
+        if missing := generate(preset, out, counts, self.seed, self.workers, shard=shard):
             left = f"trajectories of other shards that are not there yet: {missing}"
             sys.stdout.write(f"shard {shard} is in {out}; {left}\n")
             return

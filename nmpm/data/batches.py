@@ -26,7 +26,6 @@ from typing import ClassVar, Protocol, Self, TypeVar
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from nmpm._support.threads import Task
 from nmpm.data.windows import PaddedRecordings, Recording, displacements, first_frames, overlap
@@ -287,17 +286,14 @@ def _window_distances(recording: Recording, scene: Scene, length: int) -> np.nda
     """Mean distance that a particle travels within each window of `length` frames, (windows,)."""
     steps = displacements(recording.frames, scene).numpy()
     squares = (np.square(steps[..., axis]) for axis in range(steps.shape[-1]))
-    speed = _mean_over_present(np.sqrt(sum(squares)), recording.present)  # (`np.linalg.norm` takes four times as long)
-    total = np.concatenate([[0.0], np.cumsum(speed)])
+    speed = np.sqrt(sum(squares))  # (`np.linalg.norm` takes four times as long)
+    if recording.present is None:
+        mean = speed.mean(axis=-1, dtype=np.float64)
+    else:
+        there = (recording.present[1:] & recording.present[:-1]).numpy()
+        mean = (speed * there).sum(axis=-1, dtype=np.float64) / np.maximum(there.sum(axis=-1), 1)
+    total = np.concatenate([[0.0], np.cumsum(mean)])
     return np.asarray(total[length - 1 :] - total[: len(total) - length + 1])
-
-
-def _mean_over_present(speed: np.ndarray, present: Tensor | None) -> np.ndarray:
-    """(T - 1,) mean of the (T - 1, N) speeds of those particles that are there before and after; 0 of none."""
-    if present is None:
-        return np.asarray(speed.mean(axis=-1, dtype=np.float64))
-    there = (present[1:] & present[:-1]).numpy()
-    return np.asarray((speed * there).sum(axis=-1, dtype=np.float64) / np.maximum(there.sum(axis=-1), 1))
 
 
 @dataclass(frozen=True)

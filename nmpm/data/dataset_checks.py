@@ -12,7 +12,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from nmpm.data.boundaries import FEW_CROSSINGS, Openings, find_openings
-from nmpm.data.facts import never_moving, path_extents
 from nmpm.data.findings import (
     Finding,
     Severity,
@@ -34,15 +33,14 @@ from nmpm.data.findings import (
     find_time_faults,
 )
 from nmpm.data.format import Metadata, Split
-from nmpm.data.statistics import FINE_STEPS, Extent, too_coarse
-from nmpm.data.survey import RecordedMotion, is_dense, spacing_of
+from nmpm.data.statistics import FINE_STEPS, Extent, never_moving, too_coarse
+from nmpm.data.survey import RecordedMotion
 from nmpm.data.volumes import VOLUME
 from nmpm.errors import DataError
 from nmpm.scene import Interval
 
 WINDOW = 18
 """Frames of a training window of the shipped configurations."""
-_SPACING_FRAMES = 5  # in which the spacing of a trajectory is measured
 _STEADY = 1.3  # factor between spacings of a trajectory
 _LEAST_PARTICLES = 32  # of which a spacing is compared
 
@@ -104,14 +102,16 @@ class DatasetChecks:
             if gravity:
                 self._steps_of_fall[motion.where] = math.sqrt(float(np.linalg.norm(motion.fall)) / gravity)
         if len(motion.index) >= _LEAST_PARTICLES and motion.spacing:
-            if VOLUME not in motion.trajectory.attributes and (measured := _spacings(motion)):
-                dense, spacings = measured
-                (self._spacings if dense else self._sparse)[motion.where] = spacings
+            dense, spacings = motion.spacings
+            # Material points at random places are never dense; where spacings differ then, particles are in flight.
+            steady = spacings and (dense or max(spacings) < _STEADY * min(spacings))
+            if steady and VOLUME not in motion.trajectory.attributes:
+                (self._spacings if dense else self._sparse)[motion.where] = min(spacings), max(spacings)
             self._extents[motion.where], self._stays[motion.where] = motion.extent, motion.stays
         self.spacing = min(self.spacing, motion.spacing or math.inf)
         self._rounding = max(self._rounding, motion.rounding)
         types = motion.trajectory.particle_type[motion.index]
-        still = never_moving(path_extents(motion.position), motion.spacing)
+        still = never_moving(motion.position, motion.spacing)
         self._still.update(types[still].tolist())
         self._moving.update(types[~still].tolist())
         self._crossings += motion.crossings.sum(axis=(1, 2))
@@ -227,21 +227,6 @@ class DatasetChecks:
             )
 
 
-def _spacings(motion: RecordedMotion) -> tuple[bool, tuple[float, float]] | None:
-    """Whether particles are dense in some frames, and the least and the largest spacing in these.
-
-    Where they never are, as material points that are drawn at random, all frames count; None if spacings differ then:
-    particles in flight.
-    """
-    frames = np.unique(np.linspace(0, len(motion.position) - 1, _SPACING_FRAMES).astype(int))
-    dense = [frame for frame in frames if is_dense(motion.position[frame], motion.metadata)]
-    spacings = [spacing_of(motion.position[frame], motion.metadata) for frame in dense or frames]
-    spacings = [spacing for spacing in spacings if spacing]
-    if not spacings or (not dense and max(spacings) > _STEADY * min(spacings)):
-        return None
-    return bool(dense), (min(spacings), max(spacings))
-
-
 _MIXED = 1.1  # factor between time steps
 _RESOLUTIONS = 1.3  # factor between spacings
 _WALL_LAYER = 0.025  # of the bounds: positions beyond it are not in a wall layer
@@ -335,7 +320,8 @@ def compare_bounds(extent: Extent, walls: Extent, metadata: Metadata) -> Iterato
     axis = int(np.argmax(beyond))
     if beyond[axis] > 0:
         serious = beyond[axis] > _WALL_LAYER
-        mend = f" {correction(f'--bounds={_option(extent.intervals)}')}" if serious else " The domain contains them."
+        ends = ",".join(f"{low:.4g}:{high:.4g}" for low, high in extent.intervals)
+        mend = f" {correction(f'--bounds={ends}')}" if serious else " The domain contains them."
         yield Finding(
             "bounds",
             Severity.CONTRADICTION if serious else Severity.NOTE,
@@ -360,10 +346,6 @@ def _axes(mask: np.ndarray) -> str:
 
 def _span(interval: Interval) -> str:
     return f"{interval[0]:.4g}…{interval[1]:.4g}"
-
-
-def _option(intervals: tuple[Interval, ...]) -> str:
-    return ",".join(f"{low:.4g}:{high:.4g}" for low, high in intervals)
 
 
 _PARTICLES = 32  # that move, and as many that do not

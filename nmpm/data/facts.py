@@ -20,24 +20,24 @@ from typing import Any
 import numpy as np
 
 from nmpm.data.array_checks import broken_frames, particles_far_away
-from nmpm.data.boundaries import AxisEnds, Ends, boundary_fact, bounds_fact, domain_fact, find_axes, unwrap
+from nmpm.data.boundaries import Ends, boundary_fact, bounds_fact, domain_fact, find_axes, unwrap
 from nmpm.data.format import Split, Trajectory
-from nmpm.data.gravity import Gravity, Track, find_gravity
+from nmpm.data.gravity import Track, find_gravity
 from nmpm.data.metadata import FOUND, Fact, Metadata
-from nmpm.data.statistics import Extent
+from nmpm.data.spacing import find_particle_volume
+from nmpm.data.statistics import AT_REST, Extent, never_moving, path_extents
 from nmpm.data.times import TimeSteps, take_frames
-from nmpm.data.volumes import find_particle_volume
 from nmpm.errors import DataError
 from nmpm.scene import Boundary, Interval
 
 
 @dataclass(frozen=True)
 class Unmoving:
-    """Particles of a moving type that never move in a trajectory where others do."""
+    """Particles of moving types that never move in trajectories where others do."""
 
-    trajectory: int
-    particle: int  # the first of them
-    count: int
+    trajectory: int  # of the first of them
+    particle: int
+    count: int  # of all
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class FoundFacts:
     prescribed_types: Fact[frozenset[int]]
     particle_volume: Fact[float | None]  # None where it is not known
     sequence_length: Fact[int]
-    unmoving: tuple[Unmoving, ...] = ()  # particles of materials that never move where others do
+    unmoving: Unmoving | None = None  # particles of materials that never move where others do
 
     def complete(self, metadata: Metadata, unknown: Collection[str]) -> Metadata:
         """The metadata with the `unknown` fields replaced by these facts, and notes on them under the key `found`.
@@ -166,14 +166,11 @@ def _snapshot(frame: np.ndarray, types: np.ndarray) -> Typed:
     return Typed(points[np.concatenate(kept)], kinds[np.concatenate(kept)])
 
 
-_STILL = 1e-3  # of the spacing: particles of a type that move less are static
-_UNMOVED = 1e-5  # of the spacing: among others of their type, particles that move less never move
-_MOVES = 0.5  # of the spacing: half of the particles move more where a trajectory moves
+_SLOW = 1e-4  # of the spacing: a smaller acceleration of what falls is none
 _RIGID = 1e-2  # of the spacing, by which particles of a rigid body may be off
 _SAME = 0.1  # of the spacing, by which motions of one program may differ
 _START = 6  # frames in which free bodies fall as others do
 _RIGID_FRAMES, _RIGID_PARTICLES = 12, 200  # in which a rigid motion is fitted
-_MOST = 100  # of a list
 
 
 class TypeMotion:
@@ -182,33 +179,31 @@ class TypeMotion:
     def __init__(self) -> None:
         self._types: dict[int, int] = {}  # trajectories in which each type occurs
         self._range: dict[int, float] = {}  # in mean spacings
-        self._unmoving: dict[int, list[Unmoving]] = {}
+        self._unmoving: dict[int, Unmoving] = {}
         self._count = 0
 
-    def add(self, types: np.ndarray, present: np.ndarray, reach: np.ndarray, spacing: float) -> None:
-        """Adds a trajectory of N particles at a mean distance.
-
-        By particle: its type, whether it is ever there, and the extent of its path, NaN if it is there only once.
-        """
-        still = never_moving(reach, spacing)
+    def add(self, types: np.ndarray, present: np.ndarray, position: np.ndarray, spacing: float) -> None:
+        """Adds a trajectory (T, N, D) of particles at a mean distance, their types, and whether each is ever there."""
+        reach, still = path_extents(position), never_moving(position, spacing)
         for kind in np.unique(types[present]).tolist():
             farthest = float(np.fmax.reduce(reach[types == kind], initial=0.0)) / spacing
             self._types[kind] = self._types.get(kind, 0) + 1
             self._range[kind] = max(self._range.get(kind, 0.0), farthest)
-            indices, entries = np.flatnonzero(still & (types == kind)), self._unmoving.setdefault(kind, [])
-            if len(indices) and len(entries) < _MOST:
-                entries.append(Unmoving(self._count, int(indices[0]), len(indices)))
+            if len(indices := np.flatnonzero(still & (types == kind))):
+                first = self._unmoving.get(kind, Unmoving(self._count, int(indices[0]), 0))
+                self._unmoving[kind] = replace(first, count=first.count + len(indices))
         self._count += 1
 
     @property
     def static(self) -> frozenset[int]:
         """Types that never move while others do."""
-        still = frozenset(kind for kind, reach in self._range.items() if reach < _STILL)
+        still = frozenset(kind for kind, reach in self._range.items() if reach < AT_REST)
         return still if len(still) < len(self._range) else frozenset()
 
-    def unmoving(self, materials: frozenset[int]) -> tuple[Unmoving, ...]:
-        """Particles of materials that never move, at most a hundred entries per type."""
-        return tuple(one for kind in sorted(materials) for one in self._unmoving.get(kind, []))
+    def unmoving(self, materials: frozenset[int]) -> Unmoving | None:
+        """Particles of materials that never move, if there are any."""
+        each = [self._unmoving[kind] for kind in sorted(materials) if kind in self._unmoving]
+        return replace(each[0], count=sum(one.count for one in each)) if each else None
 
     def static_fact(self) -> Fact[frozenset[int]]:
         """The types that never move."""
@@ -230,21 +225,6 @@ class TypeMotion:
         rare = [f"{kind} in {number}" for kind, number in self._types.items() if number < self._count]
         how = f"by their ids{f'; of {self._count} trajectories type ' if rare else ''}{', '.join(rare)}."
         return Fact(names, how, "guessed")
-
-
-def path_extents(position: np.ndarray) -> np.ndarray:
-    """(N,) extents of the paths of particles (T, N, D) along their longest axis; NaN if one is there only once."""
-    low, high = np.fmin.reduce(position, axis=0), np.fmax.reduce(position, axis=0)
-    reach = (high - low).max(axis=1).astype(np.float64)
-    reach[np.isfinite(position[..., 0]).sum(axis=0) < 2] = np.nan
-    return np.asarray(reach)
-
-
-def never_moving(reach: np.ndarray, spacing: float) -> np.ndarray:
-    """Whether particles never move, by the extents of their paths (N,), while most of those that do go far."""
-    movers = reach[reach > _STILL * spacing]
-    far = len(movers) > 0 and float(np.median(movers)) > _MOVES * spacing
-    return np.asarray((reach < _UNMOVED * spacing) & far)
 
 
 def prescribed_fact(positions: Mapping[int, Sequence[np.ndarray]], spacing: float) -> Fact[frozenset[int]]:
@@ -282,7 +262,7 @@ def _has_program(paths: Sequence[np.ndarray], others: Sequence[np.ndarray], spac
         return True
     fall = np.median(falls, axis=0)
     size = float(np.linalg.norm(fall))
-    return size < _STILL / 10 * spacing or float(np.linalg.norm(start - fall)) > _SAME * size
+    return size < _SLOW * spacing or float(np.linalg.norm(start - fall)) > _SAME * size
 
 
 def _is_rigid(position: np.ndarray, spacing: float) -> bool:
@@ -346,7 +326,7 @@ class FactFinder:
         for kind in np.unique(types[present]).tolist():
             extent = self._extents.setdefault(kind, Extent(self.dim))
             extent.add(np.stack([low, high])[:, types == kind])
-        self._motion.add(types, present, path_extents(position), mean_spacing(low[present], high[present]))
+        self._motion.add(types, present, position, mean_spacing(low[present], high[present]))
         if self._seen % self._stride == 0:
             self._samples.append(take_sample(trajectory))
         self._seen += 1
@@ -376,6 +356,8 @@ class FactFinder:
         axes, openings = find_axes([path for _, path in tracks], self._extent(materials), beyond, spacing)
         bounds, boundary = bounds_fact(axes, spacing), boundary_fact(axes, openings)
         solid = [axis.solid for axis in axes] if materials < types else None
+        periods, between = np.array([axis.period.length if axis.period else 0.0 for axis in axes]), self._dt or dt.value
+        flights = [Track(unwrap(path, periods), sample.times(between)) for sample, path in tracks]
         few, many = min(self._frames), max(self._frames)
         frames = f"{many}" if few == many else f"{few} to {many}"
         return FoundFacts(
@@ -383,7 +365,7 @@ class FactFinder:
             domain=domain_fact(bounds.value, self._boundary or boundary.value, solid, spacing),
             boundary=boundary,
             dt=dt,
-            gravity=_find_gravity(axes, tracks, materials == types, spacing, self._dt or dt.value),
+            gravity=find_gravity(flights, spacing, between, closed=bool((periods > 0).all()) and materials == types),
             particle_types=self._motion.names_fact(prescribed.value),
             static_types=static,
             prescribed_types=prescribed,
@@ -409,15 +391,6 @@ class FactFinder:
         extents = [extent for kind, extent in self._extents.items() if kind in types]
         lower, upper = (np.stack([getattr(each, side) for each in extents]) for side in ("lower", "upper"))
         return lower.min(axis=0), upper.max(axis=0)
-
-
-def _find_gravity(
-    axes: Sequence[AxisEnds], paths: Sequence[tuple[Sample, np.ndarray]], alone: bool, spacing: float, dt: float
-) -> Fact[Gravity | None]:
-    """Gravity by the paths of materials, which are `alone` where there are no obstacles."""
-    periods = np.array([axis.period.length if axis.period else 0.0 for axis in axes])
-    tracks = [Track(unwrap(path, periods), sample.times(dt)) for sample, path in paths]
-    return find_gravity(tracks, spacing, dt, closed=bool((periods > 0).all()) and alone)
 
 
 def mean_spacing(low: np.ndarray, high: np.ndarray) -> float:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from nmpm.data.format import Metadata, Split
-from nmpm.data.hdf5 import check_stored_size, open_hdf5
+from nmpm.data.hdf5 import open_hdf5
 from nmpm.errors import DataError
 
 Kind = Literal["evolving", "property", "parameter", "constant"]
@@ -66,17 +66,9 @@ class FieldSurvey(dict[str, FieldFacts]):
 
 def read_fields(split: Split, index: int, names: Iterable[str]) -> dict[str, np.ndarray]:
     """The named fields that a trajectory has, (T, N), (1, N) or (1, 1) float32; a DataError for another shape."""
-    stored: dict[str, Any] = {}
-    if names := list(names):
-        with open_hdf5(split.path) as file:
-            group = file[split.names[index]]
-            for name in names:
-                values = group.get(name)
-                if values is not None and hasattr(values, "dtype"):
-                    check_stored_size(values, f"{split.where(index)}: {name}")
-                    stored[name] = split.cut(index, values)
-                elif name in group.attrs:
-                    stored[name] = group.attrs[name]
+    names = list(names)
+    attributes = split.attributes(index) if names else {}
+    stored = {name: attributes[name] for name in names if name in attributes} | split.stored(index, names)
     fields, sizes = dict[str, np.ndarray](), (split.frames(index), split.particles(index))
     for name, values in stored.items():
         array = np.asarray(values)

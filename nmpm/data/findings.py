@@ -14,14 +14,10 @@ from nmpm.data.array_checks import broken_frames, frames_at_one_point, particles
 from nmpm.data.boundaries import FEW_CROSSINGS
 from nmpm.data.facts import take_sample
 from nmpm.data.metadata import FOUND
+from nmpm.data.spacing import relative_positions
 from nmpm.data.stated import AXES
-from nmpm.data.statistics import (
-    first_moving_particle,
-    first_outside,
-    lengths,
-    relative_positions,
-)
-from nmpm.data.survey import RecordedMotion, smoothing_frames, spacing_of, white_noise
+from nmpm.data.statistics import first_moving_particle, first_outside, lengths
+from nmpm.data.survey import RecordedMotion, smoothing_frames
 from nmpm.data.times import find_time_fault, recorded_times, step_by_velocities
 from nmpm.data.volumes import VOLUME
 
@@ -88,7 +84,6 @@ _GOES_ON = 0.1  # of the motion before an interruption, or after it; with less o
 _LONGER = 1.7  # times the steps before and after it is a step over a missing frame
 _MOVES = 0.2  # of the typical motion: particles that are compared
 _ALIKE = 0.2  # of the median; multiples of particles that differ by less are the same
-_LOUD = 0.2  # of the typical displacement
 
 
 def find_broken_frames(motion: RecordedMotion) -> Iterator[Finding]:
@@ -267,30 +262,23 @@ def _is_multiple(motion: RecordedMotion, frame: int) -> bool:
 
 
 def find_noise(motion: RecordedMotion) -> Iterator[Finding]:
-    """Yields a finding if positions are noisy: accelerations alternate as those of errors that are new in each frame.
-
-    The second difference of independent errors of standard deviation σ has the variance 6 σ², and that of successive
-    ones correlate by -2/3.
-    """
-    noise, typical = white_noise(motion.step)
-    if noise < _LOUD * typical or not noise:
-        return
-    frames = smoothing_frames(noise / typical)
-    yield Finding(
-        "measurement noise",
-        Severity.ODDITY,
-        f"positions have errors of about {noise:.2g}, {noise / typical:.2g} of the typical displacement in a frame."
-        f" Smooth them: nmpm convert FOLDER NEW --smooth {frames}.",
-        factor=noise / typical,
-        badness=noise / typical,
-    )
+    """Yields a finding if positions are noisy."""
+    noise, share = motion.noise
+    if noise:
+        yield Finding(
+            "measurement noise",
+            Severity.ODDITY,
+            f"positions have errors of about {noise:.2g}, {share:.2g} of the typical displacement in a frame."
+            f" Smooth them: nmpm convert FOLDER NEW --smooth {smoothing_frames(share)}.",
+            factor=share,
+            badness=share,
+        )
 
 
 _LEAST_PARTICLES = 8
 _DIFFERENT = 1.2  # factor of a gravity
 _UNEVEN = 0.01  # of a step of time
 _VOLUME = (2.5, 4.0)  # factors by which a stated particle volume may be too large and too small
-_VOLUME_FRAMES = 4
 _EARTH = 9.81
 _PARALLEL = 0.9  # cosine of the angle between a stated and a measured gravity
 _SAME_NUMBER = 0.03
@@ -426,14 +414,12 @@ def _is_earth(gravity: Sequence[float] | np.ndarray) -> bool:
 
 
 def check_volume(motion: RecordedMotion) -> Iterator[Finding]:
-    """Yields a finding if the stated particle volume is far from that of the densest of some frames."""
+    """Yields a finding if the stated particle volume is far from that in the densest frame."""
     stated, dim = motion.trajectory.attributes.get(VOLUME, motion.metadata.particle_volume), motion.metadata.dim
     measured = VOLUME in motion.metadata.extra.get(FOUND, {})  # in these trajectories
     if stated is None or measured or len(motion.index) < _LEAST_PARTICLES:
         return
-    frames = np.unique(np.linspace(0, len(motion.position) - 1, _VOLUME_FRAMES).astype(int))
-    spacings = [spacing_of(motion.position[frame], motion.metadata) for frame in frames]
-    spacing = min((value for value in spacings if value), default=0.0)
+    spacing = min(motion.spacings[1], default=0.0)
     factor = stated / spacing**dim if spacing else 1.0
     too_large, too_small = _VOLUME
     if 1 / too_small < factor < too_large:

@@ -248,32 +248,22 @@ class Split:
 
     def time(self, index: int) -> np.ndarray | None:
         """The (T,) float64 times of a trajectory's frames, its field `time`; None where it has none."""
-        time = self._numbers(index, "time", (self._entries[index].frames,), "iuf")
-        return None if time is None else time.astype(np.float64)
+        time = self.stored(index, ["time"]).get("time")
+        if time is None or time.shape != (self.frames(index),) or time.dtype.kind not in "iuf":
+            return None
+        return time.astype(np.float64)
 
     def tracks(self, index: int) -> np.ndarray | None:
         """The (T, N) numbers of the particles in each column, its field `track`; None where each holds one alone."""
-        return self._numbers(index, TRACK, (self._entries[index].frames, self.particles(index)), "iu")
+        tracks = self.stored(index, [TRACK]).get(TRACK)
+        sizes = (self.frames(index), self.particles(index))
+        return tracks if tracks is not None and tracks.shape == sizes and tracks.dtype.kind in "iu" else None
 
     def ids(self, index: int) -> np.ndarray:
         """The (N,) or (T, N) numbers or texts by which the data call particles; those of columns where they do not."""
-        sizes = (self._entries[index].frames, self.particles(index))
-        with open_hdf5(self.path) as file:
-            for name in (ID, TRACK):
-                stored = file[self._entries[index].name].get(name)
-                if isinstance(stored, h5py.Dataset) and stored.shape in (sizes, sizes[1:]):
-                    check_stored_size(stored, f"{self.where(index)}: {name}")
-                    return np.asarray(self.cut(index, stored))
-        return np.arange(sizes[1])
-
-    def _numbers(self, index: int, name: str, shape: tuple[int, ...], kinds: str) -> np.ndarray | None:
-        """The frames of a field, or None if the trajectory has none of that name, shape and kinds of numbers."""
-        with open_hdf5(self.path) as file:
-            stored = file[self._entries[index].name].get(name)
-            if not isinstance(stored, h5py.Dataset) or stored.shape != shape or stored.dtype.kind not in kinds:
-                return None
-            check_stored_size(stored, f"{self.where(index)}: {name}")
-            return np.asarray(stored[self.span])
+        sizes = (self.frames(index), self.particles(index))
+        stored = self.stored(index, (ID, TRACK)).values()
+        return next((ids for ids in stored if ids.shape in (sizes, sizes[1:])), np.arange(sizes[1]))
 
     def attributes(self, index: int) -> dict[str, Any]:
         """The attributes of a trajectory."""
@@ -282,20 +272,27 @@ class Split:
 
     def fields(self, index: int) -> dict[str, np.ndarray]:
         """All datasets of a trajectory except its positions and types by name; a DataError if one has no numbers."""
-        fields: dict[str, np.ndarray] = {}
-        with open_hdf5(self.path) as file:
-            group = file[self._entries[index].name]
-            for name in group:
-                if name not in CORE and isinstance(group[name], h5py.Dataset):
-                    check_field(name, group[name], self.where(index))
-                    check_stored_size(group[name], f"{self.where(index)}: {name}")
-                    fields[name] = np.asarray(self.cut(index, group[name]))
+        fields = self.stored(index)
+        for name, values in fields.items():
+            check_field(name, values, self.where(index))
         return fields
 
-    def cut(self, index: int, values: Any) -> Any:
-        """The frames that count of a field's values, an array or a dataset; all values where they are not by frame."""
-        entry = self._entries[index]
-        return values[self.span if values.shape[:2] == (entry.frames, entry.particles) else ()]
+    def stored(self, index: int, names: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+        """Those of the named datasets that a trajectory has, or all except its positions and types.
+
+        Of those that are by frame, the frames that count.
+        """
+        entry, stored = self._entries[index], dict[str, np.ndarray]()
+        with open_hdf5(self.path) as file:
+            group = file[entry.name]
+            for name in group if names is None else names:
+                values = group.get(name)
+                if name not in CORE and isinstance(values, h5py.Dataset):
+                    check_stored_size(values, f"{self.where(index)}: {name}")
+                    sizes = (entry.frames,) if name == "time" else (entry.frames, entry.particles)
+                    by_frame = values.shape[: len(sizes)] == sizes
+                    stored[name] = np.asarray(values[self.span if by_frame else ()])
+        return stored
 
     def read_with_fields(self, index: int) -> Trajectory:
         """Reads a trajectory with its fields."""

@@ -151,13 +151,6 @@ def fit_parabolas(position: np.ndarray, time: np.ndarray) -> Parabolas:
     )
 
 
-def join(parts: Sequence[Parabolas]) -> Parabolas:
-    """Parabolas of equal duration as one set."""
-    columns = zip(*((part.velocity, part.acceleration, part.error) for part in parts), strict=True)
-    velocity, acceleration, error = map(np.concatenate, columns)
-    return Parabolas(velocity, acceleration, error, parts[0].duration)
-
-
 def shared_acceleration(parabolas: Parabolas, spacing: float) -> FreeFlight | None:
     """The acceleration that most of the moving particles share; None where fewer than two move or agree."""
     span = parabolas.duration
@@ -259,7 +252,10 @@ def _later_flight(track: Track, spacing: float) -> FreeFlight | None:
         return None
     starts = np.unique(np.linspace(0, final, _LATER).astype(int))
     windows = [slice(start, start + _LATER_FRAMES) for start in starts.tolist()]
-    every = join([fit_parabolas(track.position[window], track.time[window]) for window in windows])
+    fits = [fit_parabolas(track.position[window], track.time[window]) for window in windows]
+    columns = zip(*((fit.velocity, fit.acceleration, fit.error) for fit in fits), strict=True)
+    velocity, acceleration, error = map(np.concatenate, columns)
+    every = Parabolas(velocity, acceleration, error, fits[0].duration)
     size = np.linalg.norm(every.acceleration, axis=1)
     flight = shared_acceleration(every.select(every.error < _AGREE / 2 * size), spacing)
     return flight if flight is not None and not flight.straight and flight.share > _LATER_SHARE else None

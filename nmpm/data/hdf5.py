@@ -91,10 +91,12 @@ def check_self_contained(file: Any, path: Path) -> None:
                 pending.append(item)
             elif isinstance(item, h5py.Dataset):
                 _check_filters(item, f"{path}: {where}")
-            if isinstance(item, h5py.Dataset) and item.external:
-                raise _elsewhere_error(path, f"{where!r} is stored in another file, {item.external[0][0]!r}")
-            if isinstance(item, h5py.Dataset) and item.is_virtual and not _maps_within(file, item):
-                raise _elsewhere_error(path, f"{where!r} is a virtual dataset")
+                if item.external:
+                    raise _elsewhere_error(path, f"{where!r} is stored in another file, {item.external[0][0]!r}")
+                for source in item.virtual_sources() if item.is_virtual else ():
+                    origin = file.get(source.dset_name) if source.file_name == "." else None
+                    if not isinstance(origin, h5py.Dataset) or origin.is_virtual:
+                        raise _elsewhere_error(path, f"{where!r} is a virtual dataset")
 
 
 def _check_filters(dataset: Any, where: str) -> None:
@@ -111,12 +113,6 @@ def _check_filters(dataset: Any, where: str) -> None:
                 f"{where} is compressed by the HDF5 filter {code}{called}, which is not installed: pip install"
                 " hdf5plugin has blosc, lz4, zstd and others. Or write it anew: h5repack -f GZIP=1 OLD NEW."
             )
-
-
-def _maps_within(file: Any, dataset: Any) -> bool:
-    """Whether a virtual dataset is made of datasets of its own file alone, of which none is virtual itself."""
-    sources = [(source.file_name, file.get(source.dset_name)) for source in dataset.virtual_sources()]
-    return all(name == "." and isinstance(item, h5py.Dataset) and not item.is_virtual for name, item in sources)
 
 
 def _elsewhere_error(path: Path, problem: str) -> DataError:
@@ -199,10 +195,10 @@ def writable_hdf5(path: Path, **options: Any) -> Iterator[tuple[Any, Callable[[]
         def check() -> None:
             if target.error is not None:
                 folder = next(folder for folder in path.absolute().parents if folder.is_dir())
+                more = sum(len(content) for _, content in target.unwritten)
                 raise DataError(
-                    f"{path}: cannot be written ({target.error.strerror}): at least {target.unwritten_bytes} more bytes"
-                    f" are needed, {shutil.disk_usage(folder).free} are free on its disk. Free space or choose another"
-                    " folder."
+                    f"{path}: cannot be written ({target.error.strerror}): at least {more} more bytes are needed,"
+                    f" {shutil.disk_usage(folder).free} are free on its disk. Free space or choose another folder."
                 ) from target.error
 
         with h5py.File(target, "w", **options) as file:
@@ -220,15 +216,10 @@ class _NeverFailingFile:
     def __init__(self, descriptor: int) -> None:
         self.error: OSError | None = None
         self._descriptor, self._position = descriptor, 0
-        self._unwritten: list[tuple[int, bytes]] = []
-
-    @property
-    def unwritten_bytes(self) -> int:
-        """Size of what could not be written."""
-        return sum(len(content) for _, content in self._unwritten)
+        self.unwritten: list[tuple[int, bytes]] = []
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        ends = (os.fstat(self._descriptor).st_size, *(first + len(part) for first, part in self._unwritten))
+        ends = (os.fstat(self._descriptor).st_size, *(first + len(part) for first, part in self.unwritten))
         self._position = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: max(ends)}[whence]
         return self._position
 
@@ -243,7 +234,7 @@ class _NeverFailingFile:
         except OSError as error:
             self.error = error
         if written < len(content):
-            self._unwritten.append((self._position + written, bytes(content[written:])))
+            self.unwritten.append((self._position + written, bytes(content[written:])))
         self._position += len(content)
         return len(content)
 
@@ -257,7 +248,7 @@ class _NeverFailingFile:
         first, count = self._position, len(target)
         content = os.pread(self._descriptor, count, first)
         target[:] = content + bytes(count - len(content))
-        for offset, part in self._unwritten:
+        for offset, part in self.unwritten:
             low, high = max(first, offset), min(first + count, offset + len(part))
             if low < high:
                 target[low - first : high - first] = part[low - offset : high - offset]

@@ -20,8 +20,9 @@ from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split,
 from nmpm.data.grid_rule import GridCost, GridFacts, Machine, grid_cost, recommended_cells
 from nmpm.data.metadata import FOUND, load_json, parse_metadata
 from nmpm.data.sources import FolderSource
+from nmpm.data.spacing import neighbour_distance
 from nmpm.data.stated import guess_family
-from nmpm.data.statistics import MotionStatistics, extent_of, find_disagreements, neighbour_distance, notes_on_lengths
+from nmpm.data.statistics import MotionStatistics, extent_of, find_disagreements, notes_on_lengths
 from nmpm.data.survey import RecordedMotion, Survey
 from nmpm.errors import ConfigError, DataError, NmpmError
 from nmpm.scene import Interval, Scene
@@ -313,8 +314,6 @@ def find_contradictions(source: FolderSource) -> tuple[Finding, ...]:
         start = Split(split.path, slice(max(_START_FRAMES, _START_BYTES // (4 * split.particles(0) * split.dim))))
         for index in range(0, len(split), -(-len(split) // _TRAJECTORIES[name])):
             trajectory = start.read_with_fields(index)
-            if (time := start.time(index)) is not None:
-                trajectory.fields["time"] = time
             complete &= len(trajectory.position) == split.frames(index)
             checks.add(RecordedMotion(trajectory, source.metadata, f"{name} {split.names[index]}"))
     shared = find_shared_runs(splits, source.metadata, checks.spacing, _COMPARED)

@@ -35,7 +35,7 @@ from nmpm.data.statistics import (
     without_those_gone,
 )
 from nmpm.data.times import check_times
-from nmpm.data.volumes import check_positive, mean_volume, stated_volumes, volumes
+from nmpm.data.volumes import check_positive, mean_volume, split_volumes, stated_volumes
 from nmpm.data.windows import Presence, Recording, collate, find_tracks, obstacle_frames, pin_for
 from nmpm.errors import DataError
 from nmpm.particles import Window
@@ -246,7 +246,7 @@ class SplitRecordings(Sequence[Recording]):
         """(N,) volumes of a trajectory's particles over the mean one; None where all are alike."""
         if self._mean_volume is None:
             return None
-        values = volumes(self.split, index, self.reader.metadata)
+        values = split_volumes(self.split, index)
         return None if values is None else values / self._mean_volume
 
     @property

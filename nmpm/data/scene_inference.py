@@ -13,7 +13,8 @@ from nmpm.data.convert.base import Options
 from nmpm.data.fields import FieldSurvey, require_fields
 from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, read_metadata
 from nmpm.data.gravity import check_gravity, common_gravity, distinct_gravities, trajectory_gravity
-from nmpm.data.statistics import Extent, neighbour_distance, without_those_gone
+from nmpm.data.spacing import neighbour_distance
+from nmpm.data.statistics import Extent, without_those_gone
 from nmpm.errors import DataError
 from nmpm.scene import Interval, Scene
 

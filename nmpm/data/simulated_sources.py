@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import inspect
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Sequence
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -139,8 +139,7 @@ class SimulatedRecordings:
             if key in self._requests and self._requests[key].failed:
                 del self._requests[key]
             if key not in self._requests:
-                simulate = self._simulate if self._requests else self._simulate_first
-                self._requests[key] = Task(partial(simulate, key))
+                self._requests[key] = Task(partial(self._simulate, key, first=not self._requests))
             while len(self._requests) > _CACHED_REQUESTS:
                 self._requests.popitem(last=False)
             request = self._requests[key]
@@ -154,16 +153,15 @@ class SimulatedRecordings:
         for request in requests:
             request.cancel()
 
-    def _simulate_first(self, indices: Sequence[int]) -> list[Recording]:
-        """Simulates with a progress bar, as training waits for the first trajectories."""
-        what = f"Simulating the first {len(indices)} trajectories of {self.preset.name}"
-        with progress_bar(what, len(indices)) as advance:
-            return self._simulate(indices, advance)
-
-    def _simulate(self, indices: Sequence[int], advance: Callable[[], object] = lambda: None) -> list[Recording]:
+    def _simulate(self, indices: Sequence[int], first: bool) -> list[Recording]:
+        """Simulates, with a progress bar if these are the `first` trajectories, which training waits for."""
         entropies = [(self.seed, _STREAM, index) for index in indices]
         recordings: dict[int, Recording] = {}
-        with closing(simulate_all(self.preset, entropies, self.workers, raise_if_abandoned)) as runs:
+        what = f"Simulating the first {len(indices)} trajectories of {self.preset.name}"
+        with (
+            progress_bar(what, len(indices)) if first else nullcontext(lambda: None) as advance,
+            closing(simulate_all(self.preset, entropies, self.workers, raise_if_abandoned)) as runs,
+        ):
             for number, run in runs:
                 trajectory = Trajectory(run.position, run.particle_type, run.attributes)
                 where = f"{self.preset.name}, simulated trajectory {indices[number]}"

@@ -302,10 +302,12 @@ def generate(
     seed: int = 0,
     workers: int | None = None,
     copy_from: Path | None = None,
-) -> None:
+    shard: Shard | None = None,
+) -> int:
     """Simulates a dataset into a folder, unless it is complete already.
 
-    Several processes may call this for the same folder: the first one simulates, the others wait for it.
+    Several processes may call this for the same folder: the first one simulates, the others wait for it. Those with
+    shards simulate at the same time; the one that finishes last completes the dataset, with the same bytes.
 
     Args:
         preset: The family of scenes.
@@ -315,6 +317,10 @@ def generate(
         workers: Trajectories simulated at a time; one per processor core when left out. Where there is much to
             simulate, each is a process, of about 200 MB.
         copy_from: A complete dataset of the same preset and seed, whose trajectories are copied.
+        shard: Which trajectories to simulate; all when left out.
+
+    Returns:
+        Number of trajectories that other shards have yet to simulate; 0 if the dataset is complete.
 
     Raises:
         ConfigError: if preset or counts are invalid.
@@ -322,8 +328,22 @@ def generate(
     """
     request, folder = SimulationRequest(preset, counts, seed), Path(folder)
     if _is_complete(request, folder):  # without the lock, which needs a writable folder
-        return
-    with _explained_write_errors(folder), lock_folder(folder):
+        return 0
+    try:
+        missing = 0 if shard is None else _generate_shard(request, folder, shard, workers)
+        if not missing:
+            _generate_rest(request, folder, workers, copy_from)
+        return missing
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be written ({error}). Finished trajectories are kept; free space or correct the"
+            " permissions, and repeat the call to continue."
+        ) from error
+
+
+def _generate_rest(request: SimulationRequest, folder: Path, workers: int | None, copy_from: Path | None) -> None:
+    """Simulates what shards have not, and completes the dataset, one process at a time."""
+    with lock_folder(folder):
         if _is_complete(request, folder):
             return
         _prepare_parts(request, folder)
@@ -341,47 +361,16 @@ def generate(
         shutil.rmtree(folder / _PARTS, ignore_errors=True)
 
 
-def generate_shard(
-    preset: Preset,
-    folder: Path,
-    counts: Mapping[str, int],
-    shard: Shard,
-    seed: int = 0,
-    workers: int | None = None,
-) -> int:
-    """Simulates a shard of a dataset; the one that finishes last completes it, with the bytes that `generate` writes.
-
-    Shards may run at the same time in the same folder. Other arguments and errors are as for `generate`.
-
-    Returns:
-        Number of trajectories that other shards have yet to simulate; 0 if the dataset is complete.
-    """
-    request, folder = SimulationRequest(preset, counts, seed), Path(folder)
-    if _is_complete(request, folder):
-        return 0
-    with _explained_write_errors(folder), ExitStack() as own_lock:
+def _generate_shard(request: SimulationRequest, folder: Path, shard: Shard, workers: int | None) -> int:
+    """Simulates a shard while others may run; the number of trajectories that they have yet to simulate."""
+    with ExitStack() as own_lock:
         with lock_folder(folder):
             if _is_complete(request, folder):
                 return 0
             _prepare_parts(request, folder)
             own_lock.enter_context(lock_folder(folder / _PARTS / f"shard-{shard.index}-of-{shard.count}"))
         _simulate_parts(request, folder, shard.select(request.trajectories), workers)
-        missing = len(_missing(folder, request.trajectories))
-    if missing == 0:
-        generate(preset, folder, counts, seed, workers)
-    return missing
-
-
-@contextmanager
-def _explained_write_errors(folder: Path) -> Iterator[None]:
-    """Raises a DataError, which says how to continue, where writing to the folder fails."""
-    try:
-        yield
-    except OSError as error:
-        raise DataError(
-            f"{folder}: cannot be written ({error}). Finished trajectories are kept; free space or correct the"
-            " permissions, and repeat the call to continue."
-        ) from error
+        return len(_missing(folder, request.trajectories))
 
 
 def _is_complete(request: SimulationRequest, folder: Path) -> bool:

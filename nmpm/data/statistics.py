@@ -1,4 +1,4 @@
-"""Statistics of trajectories: extents, distances of neighbours, displacements, and what contradicts the metadata.
+"""Statistics of trajectories: extents, displacements, what moves, and what contradicts the metadata.
 
 Positions of absent particles are NaN and count nowhere; the displacement to or from them is NaN.
 """
@@ -7,22 +7,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from nmpm.data.format import Metadata, Split, Trajectory
-from nmpm.errors import DataError
+from nmpm.data.format import Metadata, Trajectory
 from nmpm.scene import Boundary, Interval, Scene
-
-if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
 
 STATISTICS_KEYS = ("vel_mean", "vel_std", "acc_mean", "acc_std")
 FINE_STEPS = 1000.0
 """Float32 numbers between neighbouring particles that are enough."""
-_STILL = 1e-3  # of the extent; displacements up to it count as rest
-_SPACING_TRAJECTORIES = 8
+AT_REST = 1e-4
+"""Spacings: particles whose paths are shorter never move."""
+_FAR = 0.5  # spacings: half of the particles move further where a trajectory moves
+_LOST = 1e-3  # of the extent: shorter displacements of walls are lost on a grid
 
 
 class Extent:
@@ -101,53 +99,6 @@ def notes_on_lengths(frames: set[int], metadata: Metadata, others: Iterable[int]
         return []
     lengths = f"{few}" if few == many else f"{few} to {many}"
     return [f"The metadata state sequence_length {metadata.sequence_length}; trajectories have {lengths} frames."]
-
-
-def neighbour_distance(split: Split, indices: Sequence[int], metadata: Metadata) -> float:
-    """Median distance of moving particles to the nearest other one, in the first frames of some trajectories.
-
-    At most 8 of them are read, evenly spaced; those that cannot be read are left out. Where particles are absent in the
-    first frame, it is measured in the frame that has most. It is 0 where it is unknown.
-    """
-    distances = [np.empty(0)]
-    for index in indices[:: -(-len(indices) // _SPACING_TRAJECTORIES)]:
-        try:
-            frame = _fullest_frame(split, index, metadata)
-        except DataError:
-            continue
-        if len(frame) > 1:
-            tree = neighbour_tree(frame, metadata)
-            distances.append(tree.query(tree.data, k=2)[0][:, 1])
-    every = np.concatenate(distances)
-    return float(np.median(every)) if len(every) else 0.0
-
-
-def relative_positions(position: np.ndarray, metadata: Metadata) -> np.ndarray:
-    """(N, D) float64 positions relative to the bounds, within the period on periodic axes."""
-    lower, upper = np.asarray(metadata.bounds, dtype=np.float64).T
-    wraps, relative = np.asarray(metadata.periodic), position.astype(np.float64) - lower
-    return np.asarray(np.where(wraps, np.mod(relative, np.where(wraps, upper - lower, 1.0)), relative))
-
-
-def neighbour_tree(position: np.ndarray, metadata: Metadata) -> cKDTree:
-    """A search tree of (N, D) positions, relative to the bounds, that wraps on periodic axes."""
-    from scipy.spatial import cKDTree  # takes 0.2 s, which loading a model need not wait for
-
-    lower, upper = np.asarray(metadata.bounds, dtype=np.float64).T
-    period = np.where(metadata.periodic, upper - lower, 0.0)  # cKDTree: 0 is not periodic
-    return cKDTree(relative_positions(position, metadata), boxsize=period)
-
-
-def _fullest_frame(split: Split, index: int, metadata: Metadata) -> np.ndarray:
-    """(N', D) positions of the moving particles in the first frame, or in the first of those that have most."""
-    moving = metadata.is_moving(split.particle_type(index))
-    frame = split.read(index, 0, 1).position[0, moving]
-    if not np.isnan(frame).any():
-        return np.asarray(frame)
-    position = split.read(index).position[:, moving]
-    present = ~np.isnan(position[..., 0])
-    fullest = int(np.argmax(present.sum(axis=1)))
-    return np.asarray(position[fullest, present[fullest]])
 
 
 def displacements(position: np.ndarray, metadata: Metadata) -> np.ndarray:
@@ -245,7 +196,11 @@ def first_outside(
 
     Outside are positions beyond walls. Only particles that are `counted`, (N,), are compared.
     """
-    if _all_within(position, domain, boundary):
+    ends = zip(np.asarray(domain, dtype=np.float32), boundary, strict=True)
+    if position.size > 0 and all(
+        kind != "wall" or bool(position[..., axis].min() >= low and position[..., axis].max() <= high)
+        for axis, ((low, high), kind) in enumerate(ends)
+    ):  # the usual case, and quicker than the following
         return None
     outside = are_outside(position, domain, boundary) & counted
     if not outside.any():
@@ -254,13 +209,20 @@ def first_outside(
     return frame, particle, int(outside.any(axis=0).sum())
 
 
-def _all_within(position: np.ndarray, domain: Sequence[Interval], boundary: Sequence[Boundary]) -> bool:
-    """Whether no position is beyond walls or NaN: quicker than `are_outside`, and the usual case."""
-    ends = zip(np.asarray(domain, dtype=np.float32), boundary, strict=True)
-    return position.size > 0 and all(
-        kind != "wall" or bool(position[..., axis].min() >= low and position[..., axis].max() <= high)
-        for axis, ((low, high), kind) in enumerate(ends)
-    )
+def path_extents(position: np.ndarray) -> np.ndarray:
+    """(N,) extents of the paths of particles (T, N, D) along their longest axis; NaN if one is there only once."""
+    low, high = np.fmin.reduce(position, axis=0), np.fmax.reduce(position, axis=0)
+    reach = (high - low).max(axis=1).astype(np.float64)
+    reach[np.isfinite(position[..., 0]).sum(axis=0) < 2] = np.nan
+    return np.asarray(reach)
+
+
+def never_moving(position: np.ndarray, spacing: float) -> np.ndarray:
+    """(N,) whether particles (T, N, D) never move, while most of those that do go far."""
+    reach = path_extents(position)
+    movers = reach[reach > AT_REST * spacing]
+    far = len(movers) > 0 and float(np.median(movers)) > _FAR * spacing
+    return np.asarray((reach < AT_REST * spacing) & far)
 
 
 def first_moving_particle(position: np.ndarray, particles: np.ndarray, extent: Sequence[Interval]) -> int | None:
@@ -269,19 +231,9 @@ def first_moving_particle(position: np.ndarray, particles: np.ndarray, extent: S
         return None
     lower, upper = np.asarray(extent).T
     candidates = position[:, particles]
-    moves = (np.abs(candidates - first_positions(candidates)) > _STILL * (upper - lower)).any(axis=(0, 2))
+    first = candidates[np.argmax(~np.isnan(candidates[..., 0]), axis=0), np.arange(candidates.shape[1])]
+    moves = (np.abs(candidates - first) > _LOST * (upper - lower)).any(axis=(0, 2))
     return int(np.flatnonzero(particles)[int(np.argmax(moves))]) if moves.any() else None
-
-
-def first_positions(position: np.ndarray) -> np.ndarray:
-    """(N, D) of (T, N, D) positions: where each particle is when it is there first; NaN if it never is."""
-    first: np.ndarray = position[0]
-    late = np.flatnonzero(np.isnan(first[:, 0]))
-    if not len(late):
-        return first
-    first, frames = first.copy(), np.argmax(~np.isnan(position[:, late, 0]), axis=0)
-    first[late] = position[frames, late]
-    return first
 
 
 def without_those_gone(position: np.ndarray, facts: Scene | Metadata) -> np.ndarray:

@@ -17,7 +17,8 @@ from nmpm.data.facts import find_facts
 from nmpm.data.format import SPLITS, Metadata, Split, Trajectory, find_split
 from nmpm.data.gravity import Gravity, Track, distinct_gravities, find_gravity, trajectory_gravity
 from nmpm.data.grid_rule import GridFacts, candidates, grid_shape
-from nmpm.data.statistics import Extent, displacements, lengths, neighbour_tree, without_those_gone
+from nmpm.data.spacing import is_dense, neighbour_tree, spacing_of
+from nmpm.data.statistics import Extent, displacements, lengths, without_those_gone
 from nmpm.data.times import recorded_step, uneven_step, usual_step
 from nmpm.errors import DataError
 from nmpm.scene import Motion, Scene
@@ -26,10 +27,11 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 _FIRST_STEPS, _LEAST_PARTICLES = 32, 8  # in which particles are looked for that fly freely
-_NEIGHBOURS = 8
-_QUERIES = 2000
-_KEPT = 0.7  # of the median distance to the nearest particle, that 90% keep; at random it is 0.39 in a plane
 _NEAR = 1.5  # spacings
+_LEAST_FRAMES = 8  # in which noise is measured
+_WHITE = -0.6  # correlation of accelerations one frame apart: -2/3 for such errors, -1/2 for random walks
+_NOISY, _ROUNDING = 0.1, 1e-3  # of a typical displacement, and of the spacing: less noise is none, or that of float32
+_SPACING_FRAMES = 5
 
 
 @dataclass(frozen=True)
@@ -149,6 +151,31 @@ class RecordedMotion:
         return spacing_of(self.position[self.fullest], self.metadata)
 
     @cached_property
+    def spacings(self) -> tuple[bool, list[float]]:
+        """Whether particles are dense in some of five frames, and their spacings in these, or else in all of them."""
+        frames = np.unique(np.linspace(0, len(self.position) - 1, _SPACING_FRAMES).astype(int))
+        dense = [frame for frame in frames if is_dense(self.position[frame], self.metadata)]
+        spacings = [spacing_of(self.position[frame], self.metadata) for frame in dense or frames]
+        return bool(dense), [spacing for spacing in spacings if spacing]
+
+    @cached_property
+    def noise(self) -> tuple[float, float]:
+        """The standard deviation of errors of positions, and its share of a typical displacement; 0 for small ones.
+
+        Errors that are new in each frame make accelerations alternate: of independent ones of standard deviation σ,
+        the second difference has the variance 6 σ², and successive ones correlate by -2/3.
+        """
+        if len(self.step) < _LEAST_FRAMES or not np.isfinite(self.step).any():
+            return 0.0, 0.0
+        acceleration = np.diff(self.step, axis=0)
+        typical, square, product = (
+            float(np.nanmean(each)) for each in (self.step**2, acceleration**2, acceleration[1:] * acceleration[:-1])
+        )
+        noise, typical = math.sqrt(square / 6), math.sqrt(typical)
+        loud = noise > max(_NOISY * typical, _ROUNDING * self.spacing)
+        return (noise, noise / typical) if loud and product <= _WHITE * square else (0.0, 0.0)
+
+    @cached_property
     def fullest(self) -> int:
         """The first frame of those with the most particles."""
         return int(np.argmax(self.present.sum(axis=1))) if self.position.size else 0
@@ -159,56 +186,17 @@ class RecordedMotion:
         return neighbour_tree(self.position[frame, there], self.metadata), there
 
 
-def is_dense(position: np.ndarray, metadata: Metadata) -> bool:
-    """Whether (N, D) particles keep their distance from one another, as in contact, and not as in flight."""
-    there = position[~np.isnan(position[:, 0])]
-    if len(there) < 2:
-        return False
-    tree = neighbour_tree(there, metadata)
-    low, middle = np.quantile(tree.query(tree.data[:: -(-len(there) // _QUERIES)], k=2)[0][:, 1], (0.1, 0.5))
-    return bool(low > _KEPT * middle)
-
-
-def spacing_of(position: np.ndarray, metadata: Metadata) -> float:
-    """The spacing of a lattice as dense as (N, D) positions around most particles; 0 for fewer than two."""
-    there = position[~np.isnan(position[:, 0])]
-    if len(there) < 2:
-        return 0.0
-    number, dim = min(_NEIGHBOURS, len(there) - 1), there.shape[1]
-    tree = neighbour_tree(there, metadata)
-    distance = tree.query(tree.data[:: -(-len(there) // _QUERIES)], k=[number + 1])[0]
-    ball = math.pi ** (dim / 2) / math.gamma(dim / 2 + 1)
-    return float(np.median(distance) * (ball / number) ** (1 / dim))
-
-
-_LEAST_FRAMES = 8
-_ENOUGH = 0.05  # of it, for velocities of a smoothed track
-_WHITE = -0.6  # correlation of accelerations one frame apart: -2/3 for such errors, -1/2 for random walks
+_ENOUGH = 0.05  # of the typical displacement, for errors of velocities of a smoothed track
 _MOST_FRAMES = 15
 
 
-def white_noise(step: np.ndarray) -> tuple[float, float]:
-    """The standard deviation of errors of positions, 0 where there are none, and the typical displacement in a frame.
-
-    Of displacements (T, N, D), NaN where a particle is absent.
-    """
-    typical = math.sqrt(float(np.nanmean(step**2)))
-    if len(step) < _LEAST_FRAMES:
-        return 0.0, typical
-    acceleration = np.diff(step, axis=0)
-    square = float(np.nanmean(acceleration**2))
-    product = float(np.nanmean(acceleration[1:] * acceleration[:-1]))
-    return (math.sqrt(square / 6) if square and product / square <= _WHITE else 0.0), typical
-
-
 def smoothing_frames(noise: float) -> int:
-    """Frames of local fits that take noise, in typical displacements, out of velocities."""
-    return next((n for n in range(5, _MOST_FRAMES, 2) if _slope_error(n) * noise < _ENOUGH), _MOST_FRAMES)
+    """Frames of local fits that take noise, in typical displacements, out of velocities.
 
-
-def _slope_error(frames: int) -> float:
-    """The standard deviation of a slope that is fitted to so many frames, in errors of a position per frame."""
-    return math.sqrt(12 / (frames**3 - frames))
+    The slope of a line that is fitted to n positions has errors of sqrt(12 / (n³ - n)) times theirs.
+    """
+    fits = (n for n in range(5, _MOST_FRAMES, 2) if math.sqrt(12 / (n**3 - n)) * noise < _ENOUGH)
+    return next(fits, _MOST_FRAMES)
 
 
 _MASK_CELLS = 64
@@ -216,7 +204,6 @@ _FRAMES_ON_GRIDS = 12
 _FAR = 2**40  # cells: overflowed positions are no integers
 _REST = 0.02  # of a trajectory's peak speed
 _BINS = np.geomspace(1e-9, 1e2, 1101)  # of speeds, in longest sides per frame; 2.3% wide
-_NOISY, _ROUNDING = 0.1, 1e-3  # of a typical step, and of the spacing: less noise is none, or that of float32
 _STATIONARY = 1.5  # ratio of mean speeds early and late
 _FULL = 0.995  # of the occupied cells that are not fuller than the density cap
 
@@ -332,9 +319,8 @@ class Survey:
             return
         early, late = motion.speed[:tenth], motion.speed[-tenth:]
         self._paces.append(np.array([[np.nanmean(early), np.nanmean(late), np.nanmedian(late)]]))
-        noise, typical = white_noise(step)
-        if noise > max(_NOISY * typical, _ROUNDING * scene.particle_spacing):
-            self.noise, self.noise_share = noise, noise / typical
+        if motion.noise[0]:
+            self.noise, self.noise_share = motion.noise
         self.gains.append(None if self.comings else energy_gain(motion.position.astype(np.float64), step, scene))
 
     @property

@@ -180,7 +180,9 @@ class TimeSteps:
         """Adds a trajectory, whose times may be recorded."""
         if (step := recorded_step(trajectory)) is not None:
             time = trajectory.fields["time"]
-            self._usual.append(exact_step(step, _SINGLE if (time == np.float32(time)).all() else _DOUBLE))
+            error = _SINGLE if (time == np.float32(time)).all() else _DOUBLE
+            plain = roundest(step * (1 - error), step * (1 + error))
+            self._usual.append(plain if float(f"{plain:.{_DIGITS}g}") == plain else step)
             self._uneven += uneven_step(time) is not None
 
     @property
@@ -211,12 +213,6 @@ class TimeSteps:
         count = len(self._usual)
         uneven = f"; in {self._uneven} of {count} trajectories steps are uneven" if self._uneven else ""
         return mixed + uneven
-
-
-def exact_step(step: float, error: float) -> float:
-    """A step, or a number with few digits that differs from it by no more than an error, a part of it."""
-    plain = roundest(step * (1 - error), step * (1 + error))
-    return plain if float(f"{plain:.{_DIGITS}g}") == plain else step
 
 
 def step_by_velocities(samples: Sequence[Sample]) -> float | None:

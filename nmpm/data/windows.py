@@ -220,25 +220,14 @@ class PaddedRecordings:
     """S recordings of a scene, padded to the longest and largest; padding particles are at the domain's centre.
 
     Args:
-        frames: (S, T, N, D) positions, in domain length, in all frames of the data.
-        material, mask, obstacle, obstacle_mask, gravity, fields, present, obstacle_frames, volume: as in `Window`, with
-            S in place of B.
+        whole: Tensors (S, …) of all frames of the data; not unwrapped, and without what lies between these frames.
+        reading: The recordings' scene, and how windows are taken out of the frames.
         tracks: (S, K, 3) the recordings' tracks, padded with such that are never there; None where all particles
             always are.
-        reading: The recordings' scene, and how windows are taken out of the frames.
     """
 
-    frames: Tensor
-    material: Tensor
-    mask: Tensor
-    obstacle: Tensor
-    obstacle_mask: Tensor
-    gravity: Tensor
+    whole: Window
     reading: Reading
-    fields: Mapping[str, Tensor] = field(default_factory=dict)
-    present: Tensor | None = None
-    obstacle_frames: Tensor | None = None
-    volume: Tensor | None = None
     tracks: np.ndarray | None = None
 
     @classmethod
@@ -247,26 +236,16 @@ class PaddedRecordings:
         recordings = _with_the_same_tensors(recordings)
         centre = [(low + high) / 2 for low, high in reading.scene.domain]
         fillers = {"frames": centre, "obstacle": centre, "obstacle_frames": centre, "volume": 1}
-
-        def stack(name: str) -> Tensor:
-            parts = [getattr(recording, name).numpy() for recording in recordings]
-            return torch.from_numpy(_stack(parts, fillers.get(name, 0)))
-
-        def mask(name: str) -> Tensor:
-            return torch.from_numpy(_stack([np.ones(len(getattr(each, name)), bool) for each in recordings], False))
-
-        first = recordings[0]
-        tensors: dict[str, Any] = {
-            name: stack(name) for name, value in vars(first).items() if isinstance(value, Tensor)
+        tensors = {
+            name: torch.from_numpy(_stack([getattr(each, name).numpy() for each in recordings], fillers.get(name, 0)))
+            for name, value in vars(recordings[0]).items()
+            if isinstance(value, Tensor)
         }
-        return cls(
-            **tensors,
-            mask=mask("material"),
-            obstacle_mask=mask("obstacle"),
-            reading=reading,
-            fields=_stack_fields(recordings),
-            tracks=None if first.tracks is None else _stack([each.tracks for each in recordings], _NO_TRACK),
-        )
+        for mask, name in (("mask", "material"), ("obstacle_mask", "obstacle")):
+            real = [np.ones(len(getattr(each, name)), bool) for each in recordings]
+            tensors[mask] = torch.from_numpy(_stack(real, False))
+        tracks = None if recordings[0].tracks is None else _stack([each.tracks for each in recordings], _NO_TRACK)
+        return cls(Window(fields=_stack_fields(recordings), **tensors), reading, tracks)
 
     def recording(self, row: int, original: Recording) -> Recording:
         """A view of one row's particles without its padding; `original` is the recording that was stacked there."""
@@ -275,15 +254,14 @@ class PaddedRecordings:
             return padded[row][_corner(values.shape)]
 
         views: dict[str, Any] = {
-            n: view(getattr(self, n), v) for n, v in vars(original).items() if isinstance(v, Tensor)
+            n: view(getattr(self.whole, n), v) for n, v in vars(original).items() if isinstance(v, Tensor)
         }
-        fields = {name: view(self.fields[name], values) for name, values in original.fields.items()}
+        fields = {name: view(self.whole.fields[name], values) for name, values in original.fields.items()}
         return replace(original, **views, fields=fields)
 
     def to(self, device: torch.device) -> PaddedRecordings:
         """Copies the tensors to a device; tensors that are there already are shared."""
-        tensors: dict[str, Any] = {k: value.to(device) for k, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(self, **tensors, fields={name: values.to(device) for name, values in self.fields.items()})
+        return replace(self, whole=self.whole.to(device))
 
     def gather(self, rows: Sequence[int], starts: Sequence[int], length: int, particles: int | None = None) -> Window:
         """Gathers `length` consecutive frames of B recordings, by their rows and first frames.
@@ -294,21 +272,19 @@ class PaddedRecordings:
 
         Rows, first frames and `length` are the data's; the windows' frames are the model's.
         """
-        row = copy_to(torch.as_tensor(rows), self.frames.device)
-        first = copy_to(torch.as_tensor(starts), self.frames.device)
+        whole, device = self.whole, self.whole.frames.device
+        row, first = (copy_to(torch.as_tensor(numbers), device) for numbers in (rows, starts))
         every, between, scene = self.reading.every, self.reading.between, self.reading.scene
-        frame = first[:, None] + torch.arange(0 if between == 1 else -1, length, device=self.frames.device)
+        frame = first[:, None] + torch.arange(0 if between == 1 else -1, length, device=device)
         frame = frame.clamp(min=0)
-        window = (
-            self._gather(row, frame, slice(particles))
-            if self.tracks is None
-            else self._gather_tracks(
-                row, frame, torch.as_tensor(_tracks_in_windows(self.tracks[rows], starts, length, particles))
-            )
-        )
+        if self.tracks is None:
+            window = self._gather(row, frame, slice(particles))
+        else:
+            tracks = _tracks_in_windows(self.tracks[rows], starts, length, particles)
+            window = self._gather_tracks(row, frame, torch.as_tensor(tracks))
         unwrap(window.frames, scene)
-        if self.obstacle_frames is not None:
-            window.obstacle_frames = self.obstacle_frames[row[:, None], frame]
+        if whole.obstacle_frames is not None:
+            window.obstacle_frames = whole.obstacle_frames[row[:, None], frame]
             unwrap(window.obstacle_frames, scene)
         if every > 1:
             window = window.pick_frames(slice(None, None, every))
@@ -325,7 +301,7 @@ class PaddedRecordings:
             each = values[:, :, columns]
             return each[row] if values.shape[1] == 1 else each[row[:, None], frame]
 
-        return self._window(row, lambda values: values[:, columns][row], of_frames, self.mask[:, columns][row])
+        return self._window(row, lambda values: values[:, columns][row], of_frames)
 
     def _gather_tracks(self, row: Tensor, frame: Tensor, tracks: Tensor) -> Window:
         """The windows of (B,) rows and (B, T) frames with (B, N', 3) of their tracks; a column of −1 is padding."""
@@ -339,27 +315,25 @@ class PaddedRecordings:
         def of_frames(values: Tensor) -> Tensor:
             return _take(values, each_row, nearest if values.shape[1] > 1 else 0, each if values.shape[2] > 1 else 0)
 
-        window = self._window(row, lambda values: values[row[:, None], column], of_frames, real)
-        window.present = there if self.present is None else there & of_frames(self.present)
+        window = self._window(row, lambda values: values[row[:, None], column], of_frames)
+        window.mask = real
+        window.present = there if self.whole.present is None else there & of_frames(self.whole.present)
         return window
 
     def _window(
-        self,
-        row: Tensor,
-        of_particles: Callable[[Tensor], Tensor],
-        of_frames: Callable[[Tensor], Tensor],
-        mask: Tensor,
+        self, row: Tensor, of_particles: Callable[[Tensor], Tensor], of_frames: Callable[[Tensor], Tensor]
     ) -> Window:
         """The windows of (B,) rows, given what picks their entries of (S, N) and of (S, T, N, …) values."""
+        whole = self.whole
         return Window(
-            frames=of_frames(self.frames),
-            material=of_particles(self.material),
-            mask=mask,
-            obstacle=self.obstacle[row],
-            obstacle_mask=self.obstacle_mask[row],
-            gravity=self.gravity[row],
-            fields={name: of_frames(values) for name, values in self.fields.items()},
-            volume=None if self.volume is None else of_particles(self.volume),
+            frames=of_frames(whole.frames),
+            material=of_particles(whole.material),
+            mask=of_particles(whole.mask),
+            obstacle=whole.obstacle[row],
+            obstacle_mask=whole.obstacle_mask[row],
+            gravity=whole.gravity[row],
+            fields={name: of_frames(values) for name, values in whole.fields.items()},
+            volume=None if whole.volume is None else of_particles(whole.volume),
         )
 
 

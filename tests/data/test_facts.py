@@ -195,7 +195,7 @@ class TestTypes:
         assert facts.static_types.value == {2}
         assert facts.prescribed_types.value == {7}
         assert facts.particle_types.value == {2: "boundary", 4: "particles", 7: "moving boundary"}
-        (still,) = facts.unmoving
+        still = facts.unmoving
         assert (still.trajectory, still.particle, still.count) == (0, 0, 3)
 
     def test_rigid_bodies_that_fall_or_differ_between_trajectories_are_free(self, rng):

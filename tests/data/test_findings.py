@@ -109,88 +109,51 @@ def test_trajectories_that_state_their_volume_may_differ_in_it(data, tmp_path):
     assert data.findings(tmp_path) == ()
 
 
-def teleported(run: np.ndarray) -> np.ndarray:
-    run[12:, 5] += 10 * SPACING * np.array([0.6, 0.8])
-    return run
+def put(*where: Any, value: Any = np.nan) -> Callable[[np.ndarray], np.ndarray]:
+    """A change of a run that puts particles somewhere in some frames; nowhere by default."""
+
+    def change(run: np.ndarray) -> np.ndarray:
+        for place in where:
+            run[place] = value(run) if callable(value) else value
+        return run
+
+    return change
 
 
-def glitched(run: np.ndarray) -> np.ndarray:
-    run[12, 5] += 10 * SPACING * np.array([0.6, 0.8])
-    return run
+def shift(where: Any, by: Any) -> Callable[[np.ndarray], np.ndarray]:
+    """A change of a run that moves particles."""
+    return lambda run: put(where, value=run[where] + by)(run)
+
+
+FLUID, ORDER = np.s_[:, : SIDE**2], np.random.default_rng(0).permutation(SIDE**2)
+JUMP = 10 * SPACING * np.array([0.6, 0.8])
+teleported, glitched = shift(np.s_[12:, 5], JUMP), shift(np.s_[12, 5], JUMP)
+doubled, stuck = put(np.s_[:, 3], value=lambda run: run[:, 4]), put(np.s_[:, :10], value=lambda run: run[0, :10])
+absent = put(np.s_[:6, 2], np.s_[-3:, 4])
+unwritten, unwritten_within, lost = put(np.s_[-4:], value=0), put(np.s_[12], value=0), put(np.s_[20:, 5], value=1e6)
+wall_moves = shift(np.s_[:, -1, 0], np.linspace(0, 0.05, FRAMES))
+shuffled_once = put(np.s_[20:, : SIDE**2], value=lambda run: run[20:, ORDER])
+overflowed = put(np.s_[-4:], value=lambda run: run[-4:] * 1e25)
+noisy = put(FLUID, value=lambda run: run[FLUID] + np.random.default_rng(0).normal(scale=0.01, size=run[FLUID].shape))
 
 
 def drifted(run: np.ndarray) -> np.ndarray:
-    run = run.copy()
-    run[:, : SIDE**2] = reflect(run[:, : SIDE**2] + 0.01 * np.maximum(0, np.arange(FRAMES) - 10)[:, None, None])
-    return run
+    drift = 0.01 * np.maximum(0, np.arange(FRAMES) - 10)[:, None, None]
+    return put(FLUID, value=reflect(run[FLUID] + drift))(run.copy())
+
+
+def shuffled(run: np.ndarray) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    return put(FLUID, value=np.stack([frame[rng.permutation(SIDE**2)] for frame in run]))(run)
 
 
 def repeated(run: np.ndarray) -> np.ndarray:
     return np.insert(run, 8, run[8], axis=0)
 
 
-def shuffled(run: np.ndarray) -> np.ndarray:
-    rng = np.random.default_rng(0)
-    for frame in range(len(run)):
-        run[frame, : SIDE**2] = run[frame, rng.permutation(SIDE**2)]
-    return run
-
-
-def shuffled_once(run: np.ndarray) -> np.ndarray:
-    order = np.random.default_rng(0).permutation(SIDE**2)
-    run[20:, : SIDE**2] = run[20:, order]
-    return run
-
-
-def doubled(run: np.ndarray) -> np.ndarray:
-    run[:, 3] = run[:, 4]
-    return run
-
-
-def wall_moves(run: np.ndarray) -> np.ndarray:
-    run[:, -1, 0] += np.linspace(0, 0.05, len(run))
-    return run
-
-
-def stuck(run: np.ndarray) -> np.ndarray:
-    run[:, :10] = run[0, :10]
-    return run
-
-
-def noisy(run: np.ndarray) -> np.ndarray:
-    run[:, : SIDE**2] += np.random.default_rng(0).normal(scale=0.01, size=run[:, : SIDE**2].shape)
-    return run
-
-
 def straight(run: np.ndarray) -> np.ndarray:
     steps = np.arange(len(run))[:, None, None] * (run[1, : SIDE**2] - run[0, : SIDE**2])
-    run[:, : SIDE**2] = reflect(run[0, : SIDE**2] + steps)
-    return run
-
-
-def absent(run: np.ndarray) -> np.ndarray:
-    run[:6, 2] = run[-3:, 4] = np.nan
-    return run
-
-
-def unwritten(run: np.ndarray) -> np.ndarray:
-    run[-4:] = 0
-    return run
-
-
-def unwritten_within(run: np.ndarray) -> np.ndarray:
-    run[12] = 0
-    return run
-
-
-def overflowed(run: np.ndarray) -> np.ndarray:
-    run[-4:] *= 1e25
-    return run
-
-
-def lost(run: np.ndarray) -> np.ndarray:
-    run[20:, 5] = 1e6
-    return run
+    return put(FLUID, value=reflect(run[0, : SIDE**2] + steps))(run)
 
 
 def stream(seed: int, reset: bool, out: bool = False) -> np.ndarray:

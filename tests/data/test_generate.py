@@ -16,7 +16,7 @@ import pytest
 
 from nmpm.cli import main
 from nmpm.data.format import Split, read_metadata
-from nmpm.data.simulation import Shard, SimulationRequest, generate, generate_shard, seed_of_draw
+from nmpm.data.simulation import Shard, SimulationRequest, generate, seed_of_draw
 from nmpm.errors import ConfigError, DataError, UnstableError
 from nmpm.sim import MpmPreset
 from tests.data.tiny_goop import COUNTS, GOOP, TINY, fingerprints
@@ -24,12 +24,11 @@ from tests.data.tiny_goop import COUNTS, GOOP, TINY, fingerprints
 SIMULATE = """
 import json, sys
 from pathlib import Path
-from nmpm.data.simulation import generate_shard
-from nmpm.data.simulation import Shard
+from nmpm.data.simulation import Shard, generate
 from nmpm.sim import preset_from_dict
 preset, folder, counts, shard = sys.argv[1:]
 preset = preset_from_dict(json.loads(preset))
-print(generate_shard(preset, Path(folder), json.loads(counts), Shard.parse(shard), seed=5))
+print(generate(preset, Path(folder), json.loads(counts), seed=5, shard=Shard.parse(shard)))
 """
 
 
@@ -39,7 +38,7 @@ def start_shard(folder: Path, shard: str, counts: dict[str, int] = COUNTS) -> su
 
 
 def run_shard(folder: Path, shard: str, seed: int = 5) -> int:
-    return generate_shard(TINY, folder, COUNTS, Shard.parse(shard), seed, workers=1)
+    return generate(TINY, folder, COUNTS, seed, workers=1, shard=Shard.parse(shard))
 
 
 @pytest.fixture(scope="module")

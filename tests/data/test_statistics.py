@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from nmpm.data.format import Split, Trajectory, write_split
+from nmpm.data.spacing import neighbour_distance
 from nmpm.data.statistics import (
     MotionStatistics,
     displacements,
@@ -9,7 +10,6 @@ from nmpm.data.statistics import (
     find_disagreements,
     first_moving_particle,
     first_outside,
-    neighbour_distance,
 )
 from tests.made_up import made_up_metadata, made_up_trajectory
 

@@ -159,11 +159,10 @@ class _Log:
             for name, how in self.metadata.extra[FOUND].items()
             if getattr(self.metadata, name) not in _PLAIN_TO_SEE and name != "sequence_length"
         ]
-        if facts.unmoving:
-            first, count = facts.unmoving[0], sum(each.count for each in facts.unmoving)
+        if still := facts.unmoving:
             self._facts.append(
-                f"{count} particles of moving types never move (in trajectory {first.trajectory}, e.g. particle"
-                f" {first.particle}). If they are walls, give them a type of their own."
+                f"{still.count} particles of moving types never move (in trajectory {still.trajectory}, e.g. particle"
+                f" {still.particle}). If they are walls, give them a type of their own."
             )
         if self.unknown & _MOVE_STATISTICS:
             self.motion = MotionStatistics(self.metadata)

@@ -9,13 +9,12 @@ import pytest
 import torch
 
 from nmpm._support.threads import raise_if_abandoned
-from nmpm.data.batches import MotionSampler, TrajectoryBuffer, WindowPlan
-from nmpm.data.format import Split, read_metadata
+from nmpm.data.batches import MotionSampler
 from nmpm.data.recordings import SplitRecordings
-from nmpm.data.scene_inference import infer_scene
 from nmpm.data.windows import Recording
 from nmpm.errors import DataError
-from nmpm.scene import Reading, Scene
+from nmpm.scene import Scene
+from tests.made_up import buffer_of
 
 MIXED = tuple((12, size) for size in (3, 4, 40, 5, 6, 30))
 
@@ -23,13 +22,6 @@ MIXED = tuple((12, size) for size in (3, 4, 40, 5, 6, 30))
 def square(**facts) -> Scene:
     sides = ((0.0, 1.0),) * 2
     return Scene(bounds=sides, domain=sides, dt=0.01, materials=("water",), particle_volume=1e-3, **facts)
-
-
-def buffer_of(folder, **options) -> TrajectoryBuffer:
-    recordings = SplitRecordings(Split(folder / "train.h5"), read_metadata(folder), Reading(infer_scene(folder)))
-    known = {"length": 5, "batch_size": 4, "buffer_size": 2, "passes": 1.0, "seed": 0}
-    frames = tuple(map(recordings.split.frames, range(len(recordings))))
-    return TrajectoryBuffer(recordings, WindowPlan(frames=frames, **(known | options)))
 
 
 def test_windows_equal_the_frames_of_the_file(make_dataset):

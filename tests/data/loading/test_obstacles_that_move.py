@@ -6,13 +6,11 @@ import torch
 
 from nmpm.data.convert import Options, convert
 from nmpm.data.format import Split, Trajectory, read_metadata, write_metadata, write_split
-from nmpm.data.recordings import SplitRecordings
 from nmpm.data.scene_inference import infer_scene
 from nmpm.data.sources import FolderSource
 from nmpm.data.windows import collate
 from nmpm.errors import ConfigError, DataError
-from nmpm.scene import Reading
-from tests.made_up import made_up_metadata, made_up_trajectory
+from tests.made_up import made_up_metadata, made_up_trajectory, recordings_of
 
 PADDLE = 2
 STEP = 0.07
@@ -33,11 +31,6 @@ def folder(tmp_path):
     types = {PADDLE: "paddle", 3: "boundary", 7: "goop"}
     write_metadata(tmp_path, made_up_metadata(particle_types=types, boundary=("periodic", "wall")))
     return tmp_path
-
-
-def recordings_of(folder, **options) -> SplitRecordings:
-    source = FolderSource(folder, Options(**options))
-    return SplitRecordings(Split(folder / "train.h5"), source.metadata, Reading(source.scene))
 
 
 def test_their_positions_in_each_frame_are_part_of_a_window(folder):

@@ -8,14 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nmpm.data.batches import TrajectoryBuffer, WindowPlan
-from nmpm.data.format import Split, Trajectory, read_metadata, write_metadata, write_split
-from nmpm.data.recordings import SplitRecordings
-from nmpm.data.scene_inference import infer_scene
+from nmpm.data.format import Split, Trajectory, write_metadata, write_split
 from nmpm.data.windows import Presence, collate, find_tracks, first_frames
 from nmpm.errors import DataError
-from nmpm.scene import Reading
-from tests.made_up import made_up_metadata, made_up_trajectory
+from tests.made_up import buffer_of, made_up_metadata, made_up_trajectory, recordings_of
 
 FRAMES = (16, 20, 13, 18)
 MISSING = 6  # a frame without any particle
@@ -41,15 +37,6 @@ def folder(tmp_path):
     write_split(tmp_path / "train.h5", [*(comes_and_goes(run, seed) for seed, run in enumerate(whole[:3])), whole[3]])
     write_metadata(tmp_path, made_up_metadata())
     return tmp_path
-
-
-def recordings_of(folder) -> SplitRecordings:
-    return SplitRecordings(Split(folder / "train.h5"), read_metadata(folder), Reading(infer_scene(folder)))
-
-
-def buffer_of(folder, **options) -> TrajectoryBuffer:
-    known = {"length": 5, "batch_size": 4, "buffer_size": 2, "passes": 1.0, "seed": 0}
-    return TrajectoryBuffer(recordings_of(folder), WindowPlan(frames=FRAMES, **(known | options)))
 
 
 @given(seed=st.integers(0, 10**6), frames=st.integers(2, 30), particles=st.integers(1, 8), share=st.floats(0, 1))
@@ -176,8 +163,8 @@ def test_particles_that_share_a_column_are_apart_in_windows(tmp_path):
         stored = Trajectory(position, np.full(position.shape[1], 7), {}, fields)
         write_split(tmp_path / "train.h5", [stored])
         recordings = recordings_of(tmp_path)
-        plan = WindowPlan(frames=(20,), length=5, batch_size=8, buffer_size=1, passes=4.0, seed=0)
-        windows += [next(TrajectoryBuffer(recordings, plan).batches()), collate([recordings[0]], recordings.reading)]
+        buffer = buffer_of(tmp_path, batch_size=8, buffer_size=1, passes=4.0)
+        windows += [next(buffer.batches()), collate([recordings[0]], recordings.reading)]
     for one, other in ((windows[0], windows[2]), (windows[1], windows[3])):
         assert torch.equal(one.frames, other.frames)
         assert torch.equal(one.present, other.present)

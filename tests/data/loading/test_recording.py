@@ -8,18 +8,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nmpm.data.convert import Options
-from nmpm.data.format import Split, read_metadata
 from nmpm.data.recordings import SplitRecordings
-from nmpm.data.scene_inference import infer_scene
 from nmpm.data.windows import unwrap
 from nmpm.errors import DataError
 from nmpm.scene import Reading, Scene
-
-
-def recordings_of(folder, **arguments) -> SplitRecordings:
-    scene = infer_scene(folder, Options(**arguments))
-    return SplitRecordings(Split(folder / "train.h5"), read_metadata(folder), Reading(scene))
+from tests.made_up import recordings_of
 
 
 def test_static_particles_are_separated(make_dataset):
