@@ -33,6 +33,7 @@ from nmpm.data.findings import (
     find_time_faults,
 )
 from nmpm.data.format import Metadata, Split
+from nmpm.data.scene_inference import WALL_LAYER
 from nmpm.data.statistics import FINE_STEPS, Extent, never_moving, too_coarse
 from nmpm.data.survey import RecordedMotion
 from nmpm.data.volumes import VOLUME
@@ -229,7 +230,6 @@ class DatasetChecks:
 
 _MIXED = 1.1  # factor between time steps
 _RESOLUTIONS = 1.3  # factor between spacings
-_WALL_LAYER = 0.025  # of the bounds: positions beyond it are not in a wall layer
 _TOO_LARGE, _FAR_TOO_LARGE = 3.0, 10.0  # times the extent of all positions
 _FEW_BOUNCES = 5
 _SOLID = 2.0  # spacings from an end
@@ -319,7 +319,7 @@ def compare_bounds(extent: Extent, walls: Extent, metadata: Metadata) -> Iterato
     larger = np.where(walled, size / np.maximum(seen, 1e-12 * size), 0.0)
     axis = int(np.argmax(beyond))
     if beyond[axis] > 0:
-        serious = beyond[axis] > _WALL_LAYER
+        serious = beyond[axis] > WALL_LAYER
         ends = ",".join(f"{low:.4g}:{high:.4g}" for low, high in extent.intervals)
         mend = f" {correction(f'--bounds={ends}')}" if serious else " The domain contains them."
         yield Finding(
@@ -393,7 +393,7 @@ def find_shared_runs(
 
 def _read_runs(splits: Mapping[str, Split], metadata: Metadata, most: int) -> Iterator[tuple[_Run, int]]:
     for name, split in splits.items():
-        for index in range(0, len(split), -(-len(split) // most)):
+        for index in split.spread(most):
             try:
                 start = split.read(index, 0, 2)
                 end = split.read(index, split.frames(index) - 1).position[0]

@@ -25,7 +25,7 @@ from nmpm.data.format import Split, Trajectory
 from nmpm.data.gravity import Track, find_gravity
 from nmpm.data.metadata import FOUND, Fact, Metadata
 from nmpm.data.spacing import find_particle_volume
-from nmpm.data.statistics import AT_REST, Extent, never_moving, path_extents
+from nmpm.data.statistics import AT_REST, Extent, evenly, never_moving, path_extents
 from nmpm.data.times import TimeSteps, take_frames
 from nmpm.errors import DataError
 from nmpm.scene import Boundary, Interval
@@ -273,13 +273,10 @@ def _is_rigid(position: np.ndarray, spacing: float) -> bool:
     if points.shape[1] <= points.shape[2] + 1 or len(points) < _START:
         return False  # any motion of few particles in few frames is almost rigid
     rounding = 8 * float(np.finfo(np.float32).eps) * float(np.abs(points).max())
-    frames = np.unique(np.linspace(0, len(points) - 1, _RIGID_FRAMES).astype(int))[1:]
+    frames = evenly(len(points), _RIGID_FRAMES)[1:]
     centred = points - points.mean(axis=1, keepdims=True)
     turned = [centred[0] @ orthogonal_procrustes(centred[0], centred[frame])[0] for frame in frames]
     return bool(np.abs(turned - centred[frames]).max() < _RIGID * spacing + rounding)
-
-
-_SAMPLE_BYTES = 2**27
 
 
 class FactFinder:
@@ -410,6 +407,6 @@ def find_facts(split: Split, metadata: Metadata | None = None) -> FoundFacts:
     """
     stated = (metadata.dt, metadata.obstacle_types) if metadata else (None, frozenset[int]())
     finder = FactFinder(split.dim, *stated)
-    for index in split.sample(_SAMPLE_BYTES):
+    for index in split.sample():
         finder.add(split.read_with_fields(index))
     return finder.facts()

@@ -231,34 +231,26 @@ def find_repeated_frames(motion: RecordedMotion) -> Iterator[Finding]:
 
 def find_missing_frames(motion: RecordedMotion) -> Iterator[Finding]:
     """Yields a finding if between two frames all particles move by a multiple of their motion before and after."""
-    typical = motion.typical
-    least = _LONGER * np.maximum(typical[:-2], typical[2:])
-    missing = [frame for frame in (np.flatnonzero(typical[1:-1] > least) + 1).tolist() if _is_multiple(motion, frame)]
-    if missing:
-        factor = float(np.median(_multiples(motion, missing[0])))
+    typical, factors = motion.typical, dict[int, float]()
+    for frame in (np.flatnonzero(typical[1:-1] > _LONGER * np.maximum(typical[:-2], typical[2:])) + 1).tolist():
+        mean = (motion.step[frame - 1] + motion.step[frame + 1]) / 2
+        square = (mean**2).sum(axis=-1)
+        moves = square > (_MOVES * typical[frame - 1]) ** 2
+        multiples = (motion.step[frame] * mean).sum(axis=-1)[moves] / square[moves]
+        low, middle, high = np.quantile(multiples, (0.25, 0.5, 0.75)) if moves.any() else (0.0, 0.0, 0.0)
+        if middle > _LONGER and high - low < _ALIKE * middle:
+            factors[frame] = float(middle)
+    if factors:
+        frame, factor = next(iter(factors.items()))
         yield Finding(
             "missing frames",
             Severity.CONTRADICTION,
             f"since the frame before, all particles move {factor:.1f} times as far as before and after it: frames are"
-            f" missing{f', so in {len(missing)} places' if len(missing) > 1 else ''}. Cut the trajectory there.",
-            details=f"frame {missing[0] + 1}",
+            f" missing{f', so in {len(factors)} places' if len(factors) > 1 else ''}. Cut the trajectory there.",
+            details=f"frame {frame + 1}",
             factor=factor,
-            badness=len(missing),
+            badness=len(factors),
         )
-
-
-def _multiples(motion: RecordedMotion, frame: int) -> np.ndarray:
-    """(N',) the step of each particle that moves, as a multiple of the mean of the steps before and after it."""
-    mean = (motion.step[frame - 1] + motion.step[frame + 1]) / 2
-    square = (mean**2).sum(axis=-1)
-    moves = square > (_MOVES * motion.typical[frame - 1]) ** 2
-    return np.asarray((motion.step[frame] * mean).sum(axis=-1)[moves] / square[moves])
-
-
-def _is_multiple(motion: RecordedMotion, frame: int) -> bool:
-    multiples = _multiples(motion, frame)
-    low, middle, high = np.quantile(multiples, (0.25, 0.5, 0.75)) if len(multiples) else (0.0, 0.0, 0.0)
-    return bool(middle > _LONGER and high - low < _ALIKE * middle)
 
 
 def find_noise(motion: RecordedMotion) -> Iterator[Finding]:
@@ -414,12 +406,12 @@ def _is_earth(gravity: Sequence[float] | np.ndarray) -> bool:
 
 
 def check_volume(motion: RecordedMotion) -> Iterator[Finding]:
-    """Yields a finding if the stated particle volume is far from that in the densest frame."""
+    """Yields a finding if the stated particle volume is far from that in frames in which particles are dense."""
     stated, dim = motion.trajectory.attributes.get(VOLUME, motion.metadata.particle_volume), motion.metadata.dim
     measured = VOLUME in motion.metadata.extra.get(FOUND, {})  # in these trajectories
     if stated is None or measured or len(motion.index) < _LEAST_PARTICLES:
         return
-    spacing = min(motion.spacings[1], default=0.0)
+    spacing = float(np.median(motion.spacings[1] or [0.0]))
     factor = stated / spacing**dim if spacing else 1.0
     too_large, too_small = _VOLUME
     if 1 / too_small < factor < too_large:

@@ -230,10 +230,14 @@ class Split:
         """Number of particles, N, of a trajectory, static ones included."""
         return self._entries[index].particles
 
-    def sample(self, size: int) -> range:
+    def sample(self, size: int = 2**27) -> range:
         """Indices of evenly spaced trajectories, with up to about `size` bytes of positions in all."""
         total = sum(4 * self.frames(index) * self.particles(index) * self.dim for index in range(len(self)))
         return range(0, len(self), max(1, -(-total // size)))
+
+    def spread(self, most: int) -> range:
+        """Indices of evenly spaced trajectories, at most so many."""
+        return range(0, len(self), -(-len(self) // most))
 
     def where(self, index: int) -> str:
         """File and trajectory, for error messages."""

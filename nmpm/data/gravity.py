@@ -17,6 +17,7 @@ import numpy as np
 from nmpm._support.messages import one_line
 from nmpm.data.format import METADATA_FILE, Metadata, Split
 from nmpm.data.metadata import Fact, Sure
+from nmpm.data.statistics import evenly
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
 
@@ -250,8 +251,7 @@ def _later_flight(track: Track, spacing: float) -> FreeFlight | None:
     final = len(track.position) - _LATER_FRAMES
     if final < 0:
         return None
-    starts = np.unique(np.linspace(0, final, _LATER).astype(int))
-    windows = [slice(start, start + _LATER_FRAMES) for start in starts.tolist()]
+    windows = [slice(start, start + _LATER_FRAMES) for start in evenly(final + 1, _LATER)]
     fits = [fit_parabolas(track.position[window], track.time[window]) for window in windows]
     columns = zip(*((fit.velocity, fit.acceleration, fit.error) for fit in fits), strict=True)
     velocity, acceleration, error = map(np.concatenate, columns)

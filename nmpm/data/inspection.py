@@ -98,7 +98,7 @@ def inspect(
     data = open_dataset(source)
     metadata, splits, scene = data.metadata, data.splits, data.scene
     samples = {
-        name: split.sample(_BYTES) if trajectories is None else range(0, len(split), -(-len(split) // trajectories))
+        name: split.sample(_BYTES) if trajectories is None else split.spread(trajectories)
         for name, split in splits.items()
     }
     first = next(iter(splits))
@@ -312,7 +312,7 @@ def find_contradictions(source: FolderSource) -> tuple[Finding, ...]:
     checks, complete = DatasetChecks(source.metadata), True
     for name, split in splits.items():
         start = Split(split.path, slice(max(_START_FRAMES, _START_BYTES // (4 * split.particles(0) * split.dim))))
-        for index in range(0, len(split), -(-len(split) // _TRAJECTORIES[name])):
+        for index in split.spread(_TRAJECTORIES[name]):
             trajectory = start.read_with_fields(index)
             complete &= len(trajectory.position) == split.frames(index)
             checks.add(RecordedMotion(trajectory, source.metadata, f"{name} {split.names[index]}"))

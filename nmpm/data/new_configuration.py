@@ -95,7 +95,7 @@ def look_at(source: FolderSource) -> Survey:
     metadata, scene = source.metadata, source.scene
     splits = {name: Split(path) for name, path in split_paths(source.folder).items()}
     split, survey = splits["train"], Survey(splits, metadata, scene)
-    sample = range(0, len(split), -(-len(split) // TRAJECTORIES))
+    sample = split.spread(TRAJECTORIES)
     with progress_bar("Looking at the data", len(sample)) as advance:
         for index in sample:
             motion = RecordedMotion(split.read(index), metadata, split.where(index))

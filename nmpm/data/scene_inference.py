@@ -18,8 +18,8 @@ from nmpm.data.statistics import Extent, without_those_gone
 from nmpm.errors import DataError
 from nmpm.scene import Interval, Scene
 
-_WALL_LAYER = 0.025  # of the extent; DeepMind's 0.1-0.9 becomes the paper's 0.08-0.92
-_SAMPLE_BYTES = 2**27
+WALL_LAYER = 0.025
+"""Of the extent; DeepMind's 0.1-0.9 becomes the paper's 0.08-0.92."""
 
 
 def infer_scene(folder: Path, options: Options | None = None) -> Scene:
@@ -59,7 +59,7 @@ def infer_scene(folder: Path, options: Options | None = None) -> Scene:
     if not types & set(metadata.moving_types):
         raise DataError(f"{split.path}: no particle has a moving type; check static_types in {METADATA_FILE}.")
     require_fields(split, metadata.fields)
-    sample, fields = split.sample(_SAMPLE_BYTES), FieldSurvey(metadata)
+    sample, fields = split.sample(), FieldSurvey(metadata)
     moving, everything = Extent(metadata.dim), Extent(metadata.dim)
     for index in sample:
         trajectory = split.read(index)
@@ -121,7 +121,7 @@ def _extents(
                 f"{where}: domain {list(domain)} on axis {axis} does not contain the positions, which reach from"
                 f" {lowest:.6g} to {highest:.6g}. Widen it."
             )
-        layer = _WALL_LAYER * (high - low)
+        layer = WALL_LAYER * (high - low)
         # If particles are beyond the layer, the stated bounds are not the walls: put the layer around the particles.
         lower = low - layer if lowest >= low - layer else lowest - layer
         upper = high + layer if highest <= high + layer else highest + layer

@@ -83,6 +83,12 @@ def float32_rounding(box: Sequence[Interval]) -> float:
     return float(np.spacing(np.float32(np.abs(box).max())))
 
 
+def evenly(count: int, most: int) -> list[int]:
+    """Indices of items from the first to the last of so many, evenly spaced."""
+    indices: list[int] = np.unique(np.linspace(0, count - 1, most).astype(int)).tolist()
+    return indices
+
+
 def extent_of(position: np.ndarray) -> Extent:
     """The extent of (T, N, D) positions."""
     extent = Extent(position.shape[2])

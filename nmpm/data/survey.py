@@ -18,7 +18,7 @@ from nmpm.data.format import SPLITS, Metadata, Split, Trajectory, find_split
 from nmpm.data.gravity import Gravity, Track, distinct_gravities, find_gravity, trajectory_gravity
 from nmpm.data.grid_rule import GridFacts, candidates, grid_shape
 from nmpm.data.spacing import is_dense, neighbour_tree, spacing_of
-from nmpm.data.statistics import Extent, displacements, lengths, without_those_gone
+from nmpm.data.statistics import Extent, displacements, evenly, lengths, without_those_gone
 from nmpm.data.times import recorded_step, uneven_step, usual_step
 from nmpm.errors import DataError
 from nmpm.scene import Motion, Scene
@@ -153,7 +153,7 @@ class RecordedMotion:
     @cached_property
     def spacings(self) -> tuple[bool, list[float]]:
         """Whether particles are dense in some of five frames, and their spacings in these, or else in all of them."""
-        frames = np.unique(np.linspace(0, len(self.position) - 1, _SPACING_FRAMES).astype(int))
+        frames = evenly(len(self.position), _SPACING_FRAMES)
         dense = [frame for frame in frames if is_dense(self.position[frame], self.metadata)]
         spacings = [spacing_of(self.position[frame], self.metadata) for frame in dense or frames]
         return bool(dense), [spacing for spacing in spacings if spacing]
@@ -243,7 +243,7 @@ class Survey:
         self.gains: list[float | None] = []  # of energy, of the initial one; None where it is not defined
         self.uneven = 0.0  # usual time between frames, where it is uneven
         self.noise = self.noise_share = 0.0  # standard deviation of positions, where they are noisy; of a typical step
-        self._paces = [np.empty((0, 3))]  # mean early, mean late and median late speed
+        self._paces: list[tuple[float, float, float]] = []  # mean early, mean late and median late speed
         self._late: list[np.ndarray] = []  # positions (N, D) in last frames
         self._counts, self._fastest = np.zeros(len(_BINS) + 1), 0.0
         numbers = candidates(self.domain, scene.particle_spacing if scene else spacing)
@@ -291,7 +291,7 @@ class Survey:
 
     def _add_cells(self, position: np.ndarray) -> None:
         for cells in self._per_cell:
-            for frame in np.unique(np.linspace(0, len(position) - 1, _FRAMES_ON_GRIDS).astype(int)):
+            for frame in evenly(len(position), _FRAMES_ON_GRIDS):
                 if len(index := self._cells(position[frame], cells)):
                     self._per_cell[cells].append(len(index) / len(np.unique(index)))
         occupied = np.zeros(self._mask.size, bool)
@@ -318,7 +318,7 @@ class Survey:
         if len(step) < 3 or not np.isfinite(step).any():
             return
         early, late = motion.speed[:tenth], motion.speed[-tenth:]
-        self._paces.append(np.array([[np.nanmean(early), np.nanmean(late), np.nanmedian(late)]]))
+        self._paces.append((float(np.nanmean(early)), float(np.nanmean(late)), float(np.nanmedian(late))))
         if motion.noise[0]:
             self.noise, self.noise_share = motion.noise
         self.gains.append(None if self.comings else energy_gain(motion.position.astype(np.float64), step, scene))
@@ -378,8 +378,7 @@ class Survey:
     @property
     def pace(self) -> tuple[float, float, float]:
         """Mean speed over the first and over the last tenth of the frames, and the median over the last."""
-        paces = np.concatenate(self._paces)
-        early, late, middle = paces.mean(axis=0).tolist() if len(paces) else (0.0, 0.0, 0.0)
+        early, late, middle = np.mean(self._paces or [(0.0, 0.0, 0.0)], axis=0).tolist()
         return early, late, middle
 
     @property
@@ -442,11 +441,11 @@ def measure_motion(folder: Path, metadata: Metadata) -> Motion:
     component's root mean square where it varies; where none states any, it is measured as particles fall.
     """
     split, speeds, stated = Split(find_split(folder, *SPLITS)), [np.zeros(0)], list[Gravity]()
-    for index in range(0, len(split), -(-len(split) // _TRAJECTORIES)):
+    for index in split.spread(_TRAJECTORIES):
         where = split.where(index)
         if (pull := trajectory_gravity(split.attributes(index), metadata, where)) is not None:
             stated.append(pull)
-        for start in np.unique(np.linspace(0, max(0, split.frames(index) - 2), _PAIRS).astype(int)).tolist():
+        for start in evenly(max(1, split.frames(index) - 1), _PAIRS):
             speed = RecordedMotion(split.read(index, start, start + 2), metadata, where).speed
             speeds.append(speed[~np.isnan(speed)])
     every = np.concatenate(speeds)

@@ -23,7 +23,7 @@ def mean_volume(split: Split, metadata: Metadata) -> float | None:
     """Mean of the `split_volumes` of moving particles, in up to 8 trajectories; None where all are alike."""
     every = [
         values[metadata.is_moving(split.particle_type(index))]
-        for index in range(0, len(split), -(-len(split) // _SAMPLE))
+        for index in split.spread(_SAMPLE)
         if (values := split_volumes(split, index)) is not None
     ]
     sample = np.concatenate([np.empty(0), *every])

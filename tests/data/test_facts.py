@@ -55,6 +55,25 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(0)
 
 
+def noisy(rng: np.random.Generator, run: np.ndarray, scale: float = 5e-4) -> np.ndarray:
+    return run + rng.normal(scale=scale, size=run.shape)
+
+
+def start_at_rest(rng: np.random.Generator, run: np.ndarray) -> np.ndarray:
+    del rng
+    return np.concatenate([np.repeat(run[:1], 20, axis=0), run])
+
+
+def push_most(rng: np.random.Generator, run: np.ndarray) -> np.ndarray:
+    run[:, 50:] += np.arange(30)[:, None, None] ** 2 * rng.uniform(0, 0.1, run[0, 50:].shape)
+    return run
+
+
+def collide_soon(rng: np.random.Generator, run: np.ndarray) -> np.ndarray:
+    collision = rng.uniform(3, 8, run.shape[1])
+    return run + np.maximum(np.arange(30)[:, None] - collision, 0)[..., None] * [0, 0.05]
+
+
 class TestGravity:
     @pytest.mark.parametrize("gravity", [(0.0, -2.0), (1.5, 0.0), (0.0, 0.0, 2.0)])
     def test_direction_sign_and_size_from_thrown_blocks(self, rng, gravity):
@@ -64,58 +83,38 @@ class TestGravity:
         assert fact.sure == "measured"
         assert "4 of 4 trajectories" in fact.how
 
+    @pytest.mark.parametrize(
+        ("disturb", "error", "sure", "how"),
+        [
+            (noisy, 0.02, None, ""),
+            (push_most, 0.01, "likely", "others collide"),
+            (collide_soon, 0.005, "measured", ""),  # from the few frames before
+            (start_at_rest, 0.02, None, "at any time"),
+        ],
+    )
+    def test_from_some_particles_or_some_frames(self, rng, disturb, error, sure, how):
+        runs = [thrown(rng, (0.0, -2.0), frames=30) for _ in range(3)]
+        runs = [disturb(rng, run) for run in runs]
+        fact = facts_of(*runs, time=0.1 * np.arange(len(runs[0]))).gravity
+        assert fact.value == pytest.approx((0.0, -2.0), abs=error)
+        assert sure in (None, fact.sure)
+        assert how in fact.how
+
     def test_is_none_where_particles_fly_straight(self, rng):
         fact = facts_of(*[thrown(rng, (0.0, 0.0)) for _ in range(3)]).gravity
         assert (fact.value, fact.sure) == ((0.0, 0.0), "measured")
 
-    def test_is_unknown_where_particles_start_at_rest(self, rng):
+    def test_is_unknown_where_particles_start_at_rest_under_noise_and_where_it_differs(self, rng):
         runs = [np.repeat(block(rng)[None], 40, axis=0) for _ in range(3)]
         for run in runs:
             run[20:] += np.cumsum(rng.normal(scale=0.02, size=(20, *run.shape[1:])), axis=0)
-        fact = facts_of(*runs).gravity
-        assert fact.value is None
-        assert "at rest in first frames" in fact.how
-
-    def test_is_unknown_under_noise_and_known_where_the_fall_exceeds_it(self, rng):
-        runs = [thrown(rng, (0.0, -2.0), frames=30) for _ in range(3)]
-        assert facts_of(*[run + rng.normal(scale=0.5, size=run.shape) for run in runs]).gravity.value is None
-        fact = facts_of(
-            *[run + rng.normal(scale=5e-4, size=run.shape) for run in runs], time=0.1 * np.arange(30)
-        ).gravity
-        assert fact.value == pytest.approx((0.0, -2.0), abs=0.02)
-
-    def test_that_differs_between_trajectories_is_reported(self, rng):
-        runs = [thrown(rng, gravity, frames=20) for gravity in ((0.0, -2.0), (2.0, 0.0), (0.0, 2.0), (-2.0, 0.0))]
-        fact = facts_of(*runs).gravity
-        assert fact.value is None
-        assert "differs" in fact.how
-
-    def test_is_likely_where_most_particles_collide(self, rng):
-        runs = [thrown(rng, (0.0, -2.0), frames=30) for _ in range(3)]
-        for run in runs:
-            run[:, 50:] += np.arange(30)[:, None, None] ** 2 * rng.uniform(0, 0.1, run[0, 50:].shape)
-        fact = facts_of(*runs, time=0.1 * np.arange(30)).gravity
-        assert fact.value == pytest.approx((0.0, -2.0), abs=0.01)
-        assert fact.sure == "likely"
-        assert "others collide" in fact.how
-
-    def test_from_the_few_frames_before_most_particles_collide(self, rng):
-        runs = [thrown(rng, (0.0, -2.0), frames=30) for _ in range(3)]
-        for run in runs:
-            collision = rng.uniform(3, 8, run.shape[1])
-            run += np.maximum(np.arange(30)[:, None] - collision, 0)[..., None] * [0, 0.05]
-        fact = facts_of(*runs, time=0.1 * np.arange(30)).gravity
-        assert fact.value == pytest.approx((0.0, -2.0), abs=0.005)
-        assert fact.sure == "measured"
-
-    def test_from_flights_after_a_start_at_rest(self, rng):
-        runs = []
-        for _ in range(3):
-            flight = thrown(rng, (0.0, -2.0), frames=30)
-            runs.append(np.concatenate([np.repeat(flight[:1], 20, axis=0), flight]))
-        fact = facts_of(*runs, time=0.1 * np.arange(50)).gravity
-        assert fact.value == pytest.approx((0.0, -2.0), abs=0.02)
-        assert "at any time" in fact.how
+        noise = [noisy(rng, thrown(rng, (0.0, -2.0), frames=30), 0.5) for _ in range(3)]
+        pulls = ((0.0, -2.0), (2.0, 0.0), (0.0, 2.0), (-2.0, 0.0))
+        differing = [thrown(rng, gravity, frames=20) for gravity in pulls]
+        for unknown, how in ((runs, "at rest in first frames"), (noise, ""), (differing, "differs")):
+            fact = facts_of(*unknown).gravity
+            assert fact.value is None
+            assert how in fact.how
 
 
 class TestBounds:
@@ -286,31 +285,20 @@ class TestTime:
     def test_from_velocities(self, rng):
         run = thrown(rng, (0.0, -2.0), frames=20)
         velocity = np.gradient(run, axis=0) / 0.04
-        fact = facts_of(run, velocity=velocity)
-        assert fact.dt.value == pytest.approx(0.04, rel=2e-3)
+        assert facts_of(run, velocity=velocity).dt.value == pytest.approx(0.04, rel=2e-3)
         backward = np.diff(run, axis=0, prepend=run[:1]) / 0.04
         assert facts_of(run, velocity=backward).dt.value == pytest.approx(0.04, rel=1e-6)
+        assert facts_of(run, velocity=velocity * 0.04, time=0.1 * np.arange(20)).dt.value == 0.1
 
     @pytest.mark.parametrize("step", [0.01, 1 / 240, 0.3333, 100.0])
-    def test_velocities_never_overrule_recorded_times(self, rng, step):
+    def test_velocities_never_overrule_recorded_times_but_tell_how_long_a_numbered_step_is(self, rng, step):
         run = thrown(rng, (0.0, -2.0), frames=20)
         velocity, time = np.gradient(run, axis=0) / 0.04, step * np.arange(20)
         assert facts_of(run, velocity=velocity, time=time).dt.value == pytest.approx(step, rel=1e-12)
-
-    def test_velocities_tell_how_long_a_numbered_step_is(self, rng):
-        run = thrown(rng, (0.0, -2.0), frames=20)
-        finder = FactFinder(2, steps=True)
-        fields = {"time": 100.0 * np.arange(20)}
-        finder.add(Trajectory(run, np.zeros(144, int), {}, fields))
-        assert finder.facts().dt.value == 100.0
-        finder = FactFinder(2, steps=True)
-        finder.add(Trajectory(run, np.zeros(144, int), {}, fields | {"velocity": np.gradient(run, axis=0) / 0.04}))
-        assert finder.facts().dt.value == pytest.approx(0.04, rel=2e-3)
-
-    def test_other_velocities(self, rng):
-        run = thrown(rng, (0.0, -2.0), frames=20)
-        velocity = np.gradient(run, axis=0) / 0.04
-        assert facts_of(run, velocity=velocity * 0.04, time=0.1 * np.arange(20)).dt.value == 0.1
+        for fields, dt in (({}, step), ({"velocity": velocity}, 0.04)):
+            finder = FactFinder(2, steps=True)
+            finder.add(Trajectory(run, np.zeros(144, int), {}, {"time": time} | fields))
+            assert finder.facts().dt.value == pytest.approx(dt, rel=2e-3)
 
 
 @pytest.mark.parametrize(
