@@ -68,7 +68,8 @@ def read_fields(split: Split, index: int, names: Iterable[str]) -> dict[str, np.
     """The named fields that a trajectory has, (T, N), (1, N) or (1, 1) float32; a DataError for another shape."""
     names = list(names)
     attributes = split.attributes(index) if names else {}
-    stored = {name: attributes[name] for name in names if name in attributes} | split.stored(index, names)
+    known = attributes | split.stored(index, names)
+    stored = {name: known[name] for name in names if name in known}
     fields, sizes = dict[str, np.ndarray](), (split.frames(index), split.particles(index))
     for name, values in stored.items():
         array = np.asarray(values)
