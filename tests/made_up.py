@@ -43,6 +43,19 @@ def made_up_metadata(dim: int = 2, **changes: object) -> Metadata:
     return Metadata(**(known | changes))
 
 
+def comes_and_goes(trajectory: Trajectory, seed: int) -> Trajectory:
+    """The same with tracks that begin and end, holes, no particle in frame 6, and particle 2 never."""
+    rng, position = np.random.default_rng(seed), trajectory.position.copy()
+    frames, particles, _ = position.shape
+    births, lives = rng.integers(-6, frames - 2, particles), rng.integers(2, 9, particles)
+    births[0], lives[0] = 0, frames
+    time = np.arange(frames)[:, None]
+    there = (time >= births) & (time < births + lives) & (rng.random((frames, particles)) > 0.1)
+    there[:, 0], there[:, 2], there[6] = True, False, False
+    position[~there] = np.nan
+    return Trajectory(position, trajectory.particle_type)
+
+
 def recordings_of(folder: Path, split: str = "train", **stated: object) -> SplitRecordings:
     """The recordings of a dataset's split, of which a user states some facts."""
     return FolderSource(folder, Options(**stated)).recordings(split)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib.util import find_spec
@@ -23,6 +23,12 @@ def one_line(text: object, limit: int = 200) -> str:
 def counted(count: int, noun: str) -> str:
     """The number with the noun, such as "1 thread" or "2 threads"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def span(interval: Sequence[float]) -> str:
+    """The ends of an interval, such as "0.1…0.9"."""
+    low, high = interval
+    return f"{low:.4g}…{high:.4g}"
 
 
 def install(extra: str) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from nmpm._support.messages import span
 from nmpm.data.boundaries import FEW_CROSSINGS, Openings, find_openings
 from nmpm.data.findings import (
     Finding,
@@ -38,11 +39,9 @@ from nmpm.data.statistics import FINE_STEPS, Extent, never_moving, too_coarse
 from nmpm.data.survey import RecordedMotion
 from nmpm.data.volumes import VOLUME
 from nmpm.errors import DataError
-from nmpm.scene import Interval
 
 WINDOW = 18
 """Frames of a training window of the shipped configurations."""
-_STEADY = 1.3  # factor between spacings of a trajectory
 _LEAST_PARTICLES = 32  # of which a spacing is compared
 
 
@@ -105,7 +104,7 @@ class DatasetChecks:
         if len(motion.index) >= _LEAST_PARTICLES and motion.spacing:
             dense, spacings = motion.spacings
             # Material points at random places are never dense; where spacings differ then, particles are in flight.
-            steady = spacings and (dense or max(spacings) < _STEADY * min(spacings))
+            steady = spacings and (dense or max(spacings) < _RESOLUTIONS * min(spacings))
             if steady and VOLUME not in motion.trajectory.attributes:
                 (self._spacings if dense else self._sparse)[motion.where] = min(spacings), max(spacings)
             self._extents[motion.where], self._stays[motion.where] = motion.extent, motion.stays
@@ -229,15 +228,12 @@ class DatasetChecks:
 
 
 _MIXED = 1.1  # factor between time steps
-_RESOLUTIONS = 1.3  # factor between spacings
+_RESOLUTIONS = 1.3  # factor between spacings of trajectories, or of a steady one
 _TOO_LARGE, _FAR_TOO_LARGE = 3.0, 10.0  # times the extent of all positions
 _FEW_BOUNCES = 5
 _SOLID = 2.0  # spacings from an end
 _STILL_SHARE = 0.01  # of the particles of a type
 _SAME_END = 2.0  # spacings between the ends of trajectories that end at the same wall
-_SAME_PART = 0.03  # of the extent, at most
-_FEW_ENDS = 3
-_END_SHARE = 0.4  # of the trajectories that end at a wall
 _STAYS = 0.3  # of the frames: particles are at a wall
 _BEYOND = 0.1  # of the extent, beyond such a wall
 _WALL_NAMES = ("wall", "boundary", "static", "obstacle", "fixed", "frozen")
@@ -283,7 +279,7 @@ def compare_spacings(spacings: Mapping[str, tuple[float, float]]) -> Iterator[Fi
 def compare_domains(
     extents: Mapping[str, np.ndarray], stays: Mapping[str, np.ndarray], spacing: float
 ) -> Iterator[Finding]:
-    """Yields a finding if particles of a trajectory stay far beyond a place at which those of many others end.
+    """Yields a finding if particles of a trajectory stay far beyond a place at which those of most others end.
 
     By trajectory: (D, 2) lowest and highest coordinates, and the share of frames in which a particle is near these.
     """
@@ -295,9 +291,9 @@ def compare_domains(
     for axis, end in np.ndindex(values.shape[1:]):
         outward, staying = values[:, axis, end] * (1 if end else -1), near[:, axis, end]
         wall = float(np.median(outward))
-        same = (np.abs(outward - wall) < min(_SAME_END * spacing, _SAME_PART * sizes[axis])) & staying
+        same = (np.abs(outward - wall) < _SAME_END * spacing) & staying
         beyond = staying & (outward - wall > max(_BEYOND * sizes[axis], 2 * _SAME_END * spacing))
-        if same.sum() >= _FEW_ENDS and same.mean() > _END_SHARE and beyond.any():
+        if 2 * same.sum() > len(names) and beyond.any():
             odd = int(np.argmax(np.where(beyond, outward, -np.inf)))
             yield Finding(
                 "different domains",
@@ -326,7 +322,7 @@ def compare_bounds(extent: Extent, walls: Extent, metadata: Metadata) -> Iterato
             "bounds",
             Severity.CONTRADICTION if serious else Severity.NOTE,
             f"along {_axes(beyond > 0)} positions reach beyond the stated ones, by up to {beyond[axis]:.2%} of their"
-            f" size: {'xyz'[axis]} is {_span(extent.intervals[axis])}, stated {_span(metadata.bounds[axis])}.{mend}",
+            f" size: {'xyz'[axis]} is {span(extent.intervals[axis])}, stated {span(metadata.bounds[axis])}.{mend}",
             factor=float(seen[axis] / size[axis]),
         )
     axis = int(np.argmax(larger))
@@ -335,17 +331,13 @@ def compare_bounds(extent: Extent, walls: Extent, metadata: Metadata) -> Iterato
             "far bounds",
             Severity.CONTRADICTION if larger[axis] > _FAR_TOO_LARGE else Severity.ODDITY,
             f"along {_axes(larger > _TOO_LARGE)} they are up to {larger[axis]:.3g} times as large as where particles"
-            f" ever are: {'xyz'[axis]} is {_span(extent.intervals[axis])}, stated {_span(metadata.bounds[axis])}.",
+            f" ever are: {'xyz'[axis]} is {span(extent.intervals[axis])}, stated {span(metadata.bounds[axis])}.",
             factor=float(larger[axis]),
         )
 
 
 def _axes(mask: np.ndarray) -> str:
     return ", ".join("xyz"[axis] for axis in np.flatnonzero(mask))
-
-
-def _span(interval: Interval) -> str:
-    return f"{interval[0]:.4g}…{interval[1]:.4g}"
 
 
 _PARTICLES = 32  # that move, and as many that do not

@@ -24,7 +24,7 @@ from nmpm.data.boundaries import Ends, boundary_fact, bounds_fact, domain_fact, 
 from nmpm.data.format import Split, Trajectory
 from nmpm.data.gravity import Track, find_gravity
 from nmpm.data.metadata import FOUND, Fact, Metadata
-from nmpm.data.spacing import find_particle_volume
+from nmpm.data.spacing import find_particle_volume, mean_spacing
 from nmpm.data.statistics import AT_REST, Extent, evenly, never_moving, path_extents
 from nmpm.data.times import TimeSteps, take_frames
 from nmpm.errors import DataError
@@ -388,13 +388,6 @@ class FactFinder:
         extents = [extent for kind, extent in self._extents.items() if kind in types]
         lower, upper = (np.stack([getattr(each, side) for each in extents]) for side in ("lower", "upper"))
         return lower.min(axis=0), upper.max(axis=0)
-
-
-def mean_spacing(low: np.ndarray, high: np.ndarray) -> float:
-    """Edge of a cube with an equal part of the box around paths, from their lower and upper ends (N, D)."""
-    sides = high.max(axis=0) - low.min(axis=0)
-    longest = float(sides.max()) or 1.0
-    return longest * math.pow(float(np.prod(np.maximum(sides / longest, 1e-3))) / len(low), 1 / len(sides))
 
 
 def find_facts(split: Split, metadata: Metadata | None = None) -> FoundFacts:

@@ -17,7 +17,7 @@ from nmpm.data.metadata import FOUND
 from nmpm.data.spacing import relative_positions
 from nmpm.data.stated import AXES
 from nmpm.data.statistics import first_moving_particle, first_outside, lengths
-from nmpm.data.survey import RecordedMotion, smoothing_frames
+from nmpm.data.survey import LEAST_PARTICLES, RecordedMotion, smoothing_frames
 from nmpm.data.times import find_time_fault, recorded_times, step_by_velocities
 from nmpm.data.volumes import VOLUME
 
@@ -267,7 +267,6 @@ def find_noise(motion: RecordedMotion) -> Iterator[Finding]:
         )
 
 
-_LEAST_PARTICLES = 8
 _DIFFERENT = 1.2  # factor of a gravity
 _UNEVEN = 0.01  # of a step of time
 _VOLUME = (2.5, 4.0)  # factors by which a stated particle volume may be too large and too small
@@ -409,7 +408,7 @@ def check_volume(motion: RecordedMotion) -> Iterator[Finding]:
     """Yields a finding if the stated particle volume is far from that in frames in which particles are dense."""
     stated, dim = motion.trajectory.attributes.get(VOLUME, motion.metadata.particle_volume), motion.metadata.dim
     measured = VOLUME in motion.metadata.extra.get(FOUND, {})  # in these trajectories
-    if stated is None or measured or len(motion.index) < _LEAST_PARTICLES:
+    if stated is None or measured or len(motion.index) < LEAST_PARTICLES:
         return
     spacing = float(np.median(motion.spacings[1] or [0.0]))
     factor = stated / spacing**dim if spacing else 1.0

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from nmpm._support.messages import one_line
+from nmpm._support.messages import one_line, span
 from nmpm._support.progress import progress_bar
 from nmpm.data.array_checks import check_end
 from nmpm.data.dataset_checks import DatasetChecks, find_shared_runs
@@ -184,7 +184,7 @@ def _describe_channels(name: str, field: FieldFacts, metadata: Metadata, materia
     """How a field varies, and the input channels that it makes."""
     if field.kind == "constant":
         return f"{_DIFFERS[field.kind]}, {field.low:.4g}: no channel"
-    varies = f"{_DIFFERS[field.kind]}, {field.low:.4g}…{field.high:.4g}"
+    varies = f"{_DIFFERS[field.kind]}, {span((field.low, field.high))}"
     if name not in metadata.fields:
         return f"{varies}; not declared: no channel (--data.fields)"
     channels = name if field.kind == "parameter" else ", ".join(f"{material}.{name}" for material in materials)

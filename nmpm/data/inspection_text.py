@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 
+from nmpm._support.messages import span
 from nmpm.data.findings import Finding, Severity, merge_findings
 from nmpm.data.inspection import Inspection, Range
 
@@ -121,4 +122,4 @@ def _span(values: Range) -> str:
 
 
 def _box(box: Iterable[tuple[float, float]]) -> str:
-    return " x ".join(f"{low:.4g}…{high:.4g}" for low, high in box)
+    return " x ".join(map(span, box))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from nmpm._support.messages import span
 from nmpm._support.progress import progress_bar
 from nmpm.data.facts import find_facts
 from nmpm.data.format import Split, find_split, split_paths
@@ -81,10 +82,12 @@ class CompletedSource:
         if survey.uneven and options.resample is None:
             options = replace(options, resample=float(f"{survey.uneven:.6g}"))
             hows["resample"] = "frames are at uneven times: positions are interpolated to even ones"
-        if survey.noise and options.smooth is None:
-            options = replace(options, smooth=smoothing_frames(survey.noise_share))
-            noise = f"{survey.noise:.2g}, {survey.noise_share:.0%} of a typical step"
-            hows["smooth"] = f"positions have a noise of {noise}: local fits replace them"
+        noise, share = survey.noise
+        if noise and options.smooth is None:
+            options = replace(options, smooth=smoothing_frames(share))
+            hows["smooth"] = (
+                f"positions have a noise of {noise:.2g}, {share:.0%} of a typical step: local fits replace them"
+            )
         if options != data.options:
             survey = look_at(data := FolderSource(path, options))
         return cls(data, hows, survey)
@@ -241,8 +244,8 @@ class SettingsChoice:
         scene, metadata = self.scene, self.source.data.metadata
         gravity = "not known" if scene.gravity is None else ", ".join(f"{g:.6g}" for g in scene.gravity)
         gravity = "of each trajectory's own" if scene.gravity_varies else gravity
-        bounds = " x ".join(f"{low:.5g}…{high:.5g}" for low, high in scene.bounds)
-        yield f"dt {metadata.dt:g}; gravity {gravity}; bounds {bounds}, {', '.join(scene.boundary)}"
+        bounds = f"{' x '.join(map(span, scene.bounds))}, {', '.join(scene.boundary)}"
+        yield f"dt {metadata.dt:g}; gravity {gravity}; bounds {bounds}"
         found = metadata.extra.get(FOUND)
         for name, how in found.items() if isinstance(found, dict) else ():
             if name not in _TRIVIAL and (not name.endswith("_types") or getattr(metadata, name, None)):

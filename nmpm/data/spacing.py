@@ -157,6 +157,13 @@ def _density_volume(position: np.ndarray) -> float:
     return float(np.median(_ball(dim) * radius[full] ** dim)) / (_NEIGHBOURS - 1)
 
 
+def mean_spacing(low: np.ndarray, high: np.ndarray) -> float:
+    """Edge of a cube with an equal part of the box around paths, from their lower and upper ends (N, D)."""
+    sides = high.max(axis=0) - low.min(axis=0)
+    longest = float(sides.max()) or 1.0
+    return longest * math.pow(float(np.prod(np.maximum(sides / longest, 1e-3))) / len(low), 1 / len(sides))
+
+
 def _ball(dim: int) -> float:
     """Volume of a ball of radius 1."""
     return math.pow(math.pi, dim / 2) / math.gamma(dim / 2 + 1)

@@ -26,7 +26,9 @@ from nmpm.scene import Motion, Scene
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-_FIRST_STEPS, _LEAST_PARTICLES = 32, 8  # in which particles are looked for that fly freely
+_FIRST_STEPS = 32  # in which particles are looked for that fly freely
+LEAST_PARTICLES = 8
+"""Of fewer, neither flights nor volumes are compared with what is stated."""
 _NEAR = 1.5  # spacings
 _LEAST_FRAMES = 8  # in which noise is measured
 _WHITE = -0.6  # correlation of accelerations one frame apart: -2/3 for such errors, -1/2 for random walks
@@ -133,7 +135,7 @@ class RecordedMotion:
 
         It is zero if they fly straight.
         """
-        if len(self.index) < _LEAST_PARTICLES or len(self.step) < 2 or not self.spacing:
+        if len(self.index) < LEAST_PARTICLES or len(self.step) < 2 or not self.spacing:
             return None
         path = self.position[0] + np.cumsum(np.insert(self.step[:_FIRST_STEPS], 0, 0.0, axis=0), axis=0)
         gravity = find_gravity([Track(path, np.arange(len(path), dtype=np.float64))], self.spacing, 1.0, closed=False)
@@ -242,7 +244,7 @@ class Survey:
         self.comings = False  # whether particles come or go
         self.gains: list[float | None] = []  # of energy, of the initial one; None where it is not defined
         self.uneven = 0.0  # usual time between frames, where it is uneven
-        self.noise = self.noise_share = 0.0  # standard deviation of positions, where they are noisy; of a typical step
+        self.noise = (0.0, 0.0)  # of a trajectory whose positions are noisy, see `RecordedMotion`
         self._paces: list[tuple[float, float, float]] = []  # mean early, mean late and median late speed
         self._late: list[np.ndarray] = []  # positions (N, D) in last frames
         self._counts, self._fastest = np.zeros(len(_BINS) + 1), 0.0
@@ -319,8 +321,7 @@ class Survey:
             return
         early, late = motion.speed[:tenth], motion.speed[-tenth:]
         self._paces.append((float(np.nanmean(early)), float(np.nanmean(late)), float(np.nanmedian(late))))
-        if motion.noise[0]:
-            self.noise, self.noise_share = motion.noise
+        self.noise = max(self.noise, motion.noise, key=lambda noise: noise[1])
         self.gains.append(None if self.comings else energy_gain(motion.position.astype(np.float64), step, scene))
 
     @property

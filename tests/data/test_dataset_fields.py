@@ -36,7 +36,7 @@ def folder(tmp_path):
         runs.append(Trajectory(run.position, run.particle_type, {"friction": 0.1 * index}, run.fields | values))
     for name in ("train", "valid", "test"):
         write_split(tmp_path / f"{name}.h5", runs)
-    write_metadata(tmp_path, made_up_metadata(fields=("temperature", "friction", "stiffness", "pressure", "force")))
+    write_metadata(tmp_path, made_up_metadata(fields=("temperature", "force", "stiffness", "pressure", "friction")))
     return tmp_path
 
 
@@ -47,7 +47,7 @@ def data_of(folder, **options):
 def test_the_kinds_follow_from_the_data_and_a_configuration_declares_others(folder):
     scene = infer_scene(folder)
     assert (scene.evolving, scene.properties) == (("temperature",), ("stiffness",))
-    assert scene.parameters == ("friction", "force")
+    assert scene.parameters == ("force", "friction")  # in the order of the metadata
     assert "pressure" not in scene.fields
     assert data_of(folder, fields=["still"]).scene.properties == ("still",)
     assert data_of(folder, fields=[]).scene.fields == ()

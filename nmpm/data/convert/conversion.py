@@ -14,6 +14,7 @@ import h5py
 import numpy as np
 
 from nmpm._support.atomic import new_folder
+from nmpm._support.messages import span
 from nmpm._support.progress import progress_bar
 from nmpm.data.array_checks import check_end, swapped_axes
 from nmpm.data.convert import native_folder, open_dataset
@@ -202,7 +203,7 @@ def _short(name: str, value: Any) -> str:
     if name == "boundary" and len(set(value)) == 1:
         return str(value[0])
     if name in ("bounds", "domain"):
-        return ", ".join(f"{axis} {low:.4g}…{high:.4g}" for axis, (low, high) in zip("xyz", value, strict=False))
+        return ", ".join(f"{axis} {span(ends)}" for axis, ends in zip("xyz", value, strict=False))
     if isinstance(value, frozenset | tuple):
         return ", ".join(_short("", each) for each in value)
     return "is not known" if value is None else str(value)

@@ -10,11 +10,12 @@ import torch
 
 from nmpm._support.threads import raise_if_abandoned
 from nmpm.data.batches import MotionSampler
+from nmpm.data.format import Split, write_split
 from nmpm.data.recordings import SplitRecordings
 from nmpm.data.windows import Recording
 from nmpm.errors import DataError
 from nmpm.scene import Scene
-from tests.made_up import buffer_of
+from tests.made_up import buffer_of, comes_and_goes
 
 MIXED = tuple((12, size) for size in (3, 4, 40, 5, 6, 30))
 
@@ -35,26 +36,25 @@ def test_windows_equal_the_frames_of_the_file(make_dataset):
             assert (window.frames[row, :, count:] == 0.5).all()  # padding is in the middle of the domain
 
 
+@pytest.mark.parametrize("gaps", [False, True], ids=["complete", "with gaps"])
 @pytest.mark.parametrize(
     ("start", "shares"),
     [(1, {}), (6, {"emphasis": 0.5, "openings": 0.3}), (15, {"emphasis": 0.5, "bucket": 4}), (40, {})],
 )
-def test_resumes_at_any_batch(make_dataset, start, shares):
-    buffer = buffer_of(make_dataset(train=((12, 5), (9, 7), (14, 6), (7, 3), (8, 4))), **shares)
-    straight = list(islice(buffer.batches(), start + 8))
-    resumed = list(islice(buffer.batches(start), 8))
-    for expected, window in zip(straight[start:], resumed, strict=True):
-        assert torch.equal(window.frames, expected.frames)
+def test_resumes_at_any_batch_and_ranks_together_have_the_batches_of_one_process(make_dataset, gaps, start, shares):
+    folder = make_dataset(train=((12, 5), (9, 7), (14, 6), (7, 3), (8, 4)))
+    if gaps:
+        runs = [Split(folder / "train.h5").read(index) for index in range(5)]
+        write_split(folder / "train.h5", [*map(comes_and_goes, runs[:3], range(3)), *runs[3:]])
+    buffer, rank = buffer_of(folder, **shares), buffer_of(folder, **shares | {"batch_size": 2})
+    straight, resumed = islice(buffer.batches(), start, start + 8), islice(buffer.batches(start), 8)
+    ranks = [rank.batches(start, number, 2) for number in range(2)]
+    for expected, window, *parts in zip(straight, resumed, *ranks, strict=False):
         assert torch.equal(window.mask, expected.mask)
-
-
-@pytest.mark.parametrize("shares", [{"emphasis": 0.3, "openings": 0.5}, {"emphasis": 0.5, "bucket": 4}])
-def test_ranks_together_have_the_batches_of_one_process(make_dataset, shares):
-    folder = make_dataset(train=MIXED)
-    parts = [buffer_of(folder, batch_size=2, **shares).batches(rank=rank, world=3) for rank in range(3)]
-    one = buffer_of(folder, batch_size=6, **shares).batches()
-    for *ranks, whole in islice(zip(*parts, one, strict=True), 12):
-        assert torch.equal(torch.cat([part.frames for part in ranks]), whole.frames)
+        for name in ("frames", "present") if expected.present is not None else ("frames",):
+            assert torch.equal(getattr(window, name), getattr(expected, name))
+            assert torch.equal(torch.cat([getattr(part, name) for part in parts]), getattr(expected, name))
+        assert (window.present is None) == (expected.present is None)
 
 
 def test_closing_the_iterator_ends_its_thread(make_dataset, monkeypatch):

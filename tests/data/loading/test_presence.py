@@ -11,23 +11,9 @@ from hypothesis import strategies as st
 from nmpm.data.format import Split, Trajectory, write_metadata, write_split
 from nmpm.data.windows import Presence, collate, find_tracks, first_frames
 from nmpm.errors import DataError
-from tests.made_up import buffer_of, made_up_metadata, made_up_trajectory, recordings_of
+from tests.made_up import buffer_of, comes_and_goes, made_up_metadata, made_up_trajectory, recordings_of
 
 FRAMES = (16, 20, 13, 18)
-MISSING = 6  # a frame without any particle
-
-
-def comes_and_goes(trajectory: Trajectory, seed: int) -> Trajectory:
-    """The same with tracks that begin and end, holes, a missing frame, and particle 2 never there."""
-    rng, position = np.random.default_rng(seed), trajectory.position.copy()
-    frames, particles, _ = position.shape
-    births, lives = rng.integers(-6, frames - 2, particles), rng.integers(2, 9, particles)
-    births[0], lives[0] = 0, frames
-    time = np.arange(frames)[:, None]
-    there = (time >= births) & (time < births + lives) & (rng.random((frames, particles)) > 0.1)
-    there[:, 0], there[:, 2], there[MISSING] = True, False, False
-    position[~there] = np.nan
-    return Trajectory(position, trajectory.particle_type)
 
 
 @pytest.fixture
@@ -95,21 +81,6 @@ def overlapping(run: np.ndarray, first: int) -> np.ndarray:
     """(N,) whether the time between a particle's first and last frame overlaps a window of five frames."""
     there = ~np.isnan(run[..., 0])
     return there[: first + 5].any(axis=0) & there[first:].any(axis=0)
-
-
-@pytest.mark.parametrize("options", [{}, {"emphasis": 0.5, "openings": 0.3, "bucket": 2}], ids=str)
-def test_resumes_at_any_batch_with_all_ranks_alike(folder, options):
-    straight = list(islice(buffer_of(folder, **options).batches(), 20))
-    resumed = islice(buffer_of(folder, **options).batches(9), 11)
-    ranks = [buffer_of(folder, **options | {"batch_size": 2}).batches(9, rank, 2) for rank in range(2)]
-    for expected, window, *parts in zip(straight[9:], resumed, *ranks, strict=False):
-        joined = torch.cat([part.frames for part in parts])
-        assert torch.equal(window.frames, expected.frames)
-        assert torch.equal(joined, expected.frames)
-        assert (window.present is None) == (expected.present is None)
-        if window.present is not None:
-            assert torch.equal(window.present, expected.present)
-            assert torch.equal(torch.cat([part.present for part in parts]), expected.present)
 
 
 def test_a_complete_trajectory_is_the_same_beside_others(folder):
