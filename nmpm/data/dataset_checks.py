@@ -32,6 +32,7 @@ from nmpm.data.findings import (
     find_repeated_frames,
     find_swapped_axes,
     find_time_faults,
+    prescription,
 )
 from nmpm.data.format import Metadata, Split
 from nmpm.data.scene_inference import WALL_LAYER
@@ -207,8 +208,8 @@ class DatasetChecks:
             yield Finding(
                 "walls that are predicted",
                 Severity.CONTRADICTION,
-                f"type {', '.join(f'{i}, {names[i]},' for i in walls)} moves and counts as a material. If it is an"
-                f" obstacle that moves as recorded: nmpm convert FOLDER NEW --prescribed {','.join(map(str, walls))}.",
+                f"type {', '.join(f'{i}, {names[i]},' for i in walls)} moves and counts as a material."
+                f" {prescription(walls)}",
             )
 
     def _check_lengths(self) -> Iterator[Finding]:

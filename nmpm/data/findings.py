@@ -445,8 +445,7 @@ def find_moving_walls(motion: RecordedMotion) -> Iterator[Finding]:
         yield Finding(
             "moving walls",
             Severity.CONTRADICTION,
-            f"it moves, though its type {types[mover]}, {name}, is static. If it is an obstacle that moves as recorded:"
-            f" nmpm convert FOLDER NEW --prescribed {types[mover]}.",
+            f"it moves, though its type {types[mover]}, {name}, is static. {prescription([int(types[mover])])}",
             details=f"particle {mover}",
         )
 
@@ -493,6 +492,12 @@ def too(factor: float) -> str:
 def correction(option: str) -> str:
     """The sentence that says how an option corrects the metadata."""
     return f"Correct it: nmpm convert FOLDER NEW {option}."
+
+
+def prescription(types: Iterable[int]) -> str:
+    """The sentence that says how particles of some types become obstacles that move as recorded."""
+    ids = ",".join(map(str, types))
+    return f"If it is an obstacle that moves as recorded: nmpm convert FOLDER NEW --prescribed {ids}."
 
 
 def _vector(values: Sequence[float] | np.ndarray) -> str:

@@ -60,9 +60,14 @@ def check_gravity(given: Sequence[float], stated: Gravity | None, path: Path) ->
     if stated is not None and not _equal(values, stated):
         raise ConfigError(
             f"gravity = {list(values)} contradicts {path}, which states gravity {list(stated)}. Leave the option"
-            " out to use the file's; if the file is wrong, write a corrected copy with nmpm convert FOLDER NEW"
-            f" --gravity={','.join(f'{value:g}' for value in values)}."
+            f" out to use the file's; if the file is wrong, {_corrected_copy(values)}."
         )
+
+
+def _corrected_copy(gravity: Gravity) -> str:
+    return (
+        f"write a corrected copy with nmpm convert FOLDER NEW --gravity={','.join(f'{value:g}' for value in gravity)}"
+    )
 
 
 def common_gravity(gravities: tuple[Gravity, ...], metadata: Metadata, split: Split) -> Gravity | None:
@@ -76,8 +81,8 @@ def common_gravity(gravities: tuple[Gravity, ...], metadata: Metadata, split: Sp
     if metadata.gravity and only is not None and not _equal(metadata.gravity, only):
         raise DataError(
             f"{split.path}: all trajectories have the attribute gravity {list(only)}, but {METADATA_FILE} states"
-            f" {list(metadata.gravity)}. If the trajectories are right, write a corrected copy with nmpm convert FOLDER"
-            f" NEW --gravity={','.join(f'{value:g}' for value in only)}; otherwise remove their attribute."
+            f" {list(metadata.gravity)}. If the trajectories are right, {_corrected_copy(only)}; otherwise remove their"
+            " attribute."
         )
     return metadata.gravity or only
 

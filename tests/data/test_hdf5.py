@@ -40,18 +40,20 @@ def link_through_another_link(file: h5py.File) -> None:
     file["00001/position"] = h5py.SoftLink("/hidden/door/00000/position")
 
 
-def make_virtual(file: h5py.File) -> None:
+def add_virtual(file: h5py.File, name: str, source: str, path: str = ".") -> None:
     layout = h5py.VirtualLayout((4, 3, 2), np.float32)
-    layout[:] = h5py.VirtualSource("other.h5", "00000/position", (4, 3, 2))
-    file["00001"].create_virtual_dataset("position", layout)
+    layout[:] = h5py.VirtualSource(path, source, (4, 3, 2))
+    file["00001"].create_virtual_dataset(name, layout)
+
+
+def make_virtual(file: h5py.File) -> None:
+    add_virtual(file, "position", "00000/position", "other.h5")
 
 
 def make_chain(file: h5py.File) -> None:
     """Of virtual datasets of the same file; a ring of them would be followed without end."""
-    for name, source in (("position", "/00001/copy"), ("copy", "/00000/position")):
-        layout = h5py.VirtualLayout((4, 3, 2), np.float32)
-        layout[:] = h5py.VirtualSource(".", source, (4, 3, 2))
-        file["00001"].create_virtual_dataset(name, layout)
+    add_virtual(file, "position", "/00001/copy")
+    add_virtual(file, "copy", "/00000/position")
 
 
 def link(file: h5py.File) -> None:
@@ -85,11 +87,9 @@ def test_links_within_the_file_are_read(split):
 
 
 def test_virtual_datasets_of_the_files_own_content_are_read(split):
-    layout = h5py.VirtualLayout((4, 3, 2), np.float32)
-    layout[:] = h5py.VirtualSource(".", "/00000/position", (4, 3, 2))
     with h5py.File(split, "a", libver=("earliest", "v110")) as file:
         del file["00001/position"]
-        file["00001"].create_virtual_dataset("position", layout)
+        add_virtual(file, "position", "/00000/position")
     np.testing.assert_array_equal(Split(split).read(1).position, Split(split).read(0).position)
 
 
