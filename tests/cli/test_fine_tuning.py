@@ -37,10 +37,8 @@ PATIENT = {"class_path": "lightning.pytorch.callbacks.EarlyStopping"}
 
 
 @pytest.fixture
-def fit(make_dataset, tmp_path, monkeypatch):
+def fit(make_dataset, tmp_path):
     """Runs `nmpm fit` on made-up data with a learning rate and further words."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
     make_dataset(train=((30, 9),) * 2, valid=((30, 9),), test=((30, 9),)).rename(tmp_path / "data")
     Path("tiny.yaml").write_text(TINY)
 

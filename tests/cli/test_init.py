@@ -1,21 +1,10 @@
 import json
 from pathlib import Path
 
-import pytest
 import yaml
 
 from nmpm.cli import main
-
-TINY = [
-    *("--trainer.max_steps", "2", "--trainer.val_check_interval", "2", "--data.batch_size", "2"),
-    *("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false", "--model.unroll", "1"),
-]
-
-
-@pytest.fixture(autouse=True)
-def elsewhere(tmp_path, monkeypatch):
-    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
-    monkeypatch.chdir(tmp_path)
+from tests.cli.test_training_commands import TINY
 
 
 def test_fit_without_a_configuration_writes_and_takes_that_of_init(make_dataset, capsys):
@@ -40,19 +29,3 @@ def test_a_configuration_states_obstacles_that_move_as_recorded(make_dataset):
     folder = str(make_dataset(train=((40, 9),), valid=(), test=(), statics=4))
     assert main(["init", folder, "--prescribed", "3", "--out", "made.yaml"]) == 0
     assert yaml.safe_load(Path("made.yaml").read_text())["data"]["prescribed"] == [3]
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["nowhere"], "nowhere: there is no such file or folder."),
-        (["data", "--out", "there.yaml"], "there.yaml exists already"),
-        (["data", "--dt", "0.1"], "--dt: a configuration cannot state it; write it into a copy of the data"),
-        (["data", "--minutes", "0"], "--minutes 0: it must be positive."),
-    ],
-)
-def test_mistakes_are_told_before_the_work(words, message, capsys):
-    Path("data").mkdir()
-    Path("there.yaml").touch()
-    assert main(["init", *words]) == 1
-    assert message in capsys.readouterr().err

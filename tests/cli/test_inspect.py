@@ -31,8 +31,7 @@ def test_one_screen_and_a_picture(dataset, tmp_path, capsys):
         assert min(picture.size) > 200
 
 
-def test_json_is_all_there_is_on_standard_output(dataset, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_json_is_all_there_is_on_standard_output(dataset, tmp_path, capsys):
     assert main(["inspect", str(dataset), "--json"]) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["splits"]["train"]["particles"] == [40, 50]
@@ -45,14 +44,12 @@ def test_one_split_stands_for_its_dataset(dataset, capsys):
     assert "train     2 trajectories" in capsys.readouterr().out
 
 
-def test_types_that_the_files_do_not_name_can_be_named(dataset, tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+def test_types_that_the_files_do_not_name_can_be_named(dataset, capsys):
     assert main(["inspect", str(dataset), "--types", "7=honey", "--no-picture"]) == 0
     assert "honey (40-50)" in capsys.readouterr().out
 
 
-def test_types_that_are_found_to_rest_do_so_under_the_names_that_a_user_states(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+def test_types_that_are_found_to_rest_do_so_under_the_names_that_a_user_states(tmp_path, capsys):
     rng = np.random.default_rng(0)
     position = rng.uniform(0, 1, (4, 1, 40, 2)) + 1e-3 * rng.normal(size=(4, 30, 40, 2)).cumsum(axis=1)
     position[:, :, 30:] = position[:1, :1, 30:]
@@ -76,8 +73,7 @@ def test_a_cache_that_cannot_be_written_is_named(tmp_path, monkeypatch, capsys):
         native_folder(tmp_path / "ramps")
 
 
-def test_a_gravity_that_contradicts_foreign_data_is_a_finding(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
+def test_a_gravity_that_contradicts_foreign_data_is_a_finding(tmp_path, capsys):
     folder = tmp_path / "ramps"
     for split in ("train", "valid", "test"):
         records.write_records(folder / f"{split}.tfrecord", records.trajectory_record(*made(frames=8)))

@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +14,10 @@ from nmpm.cli.run_training import EmulatorCLI
 from nmpm.data.format import Split, read_metadata, write_metadata, write_split
 from nmpm.scene import Reading
 from nmpm.zoo import Zoo
+from tests.cli.test_training_commands import TINY
 from tests.made_up import made_up_metadata, made_up_trajectory
 
 LINES = ("cells", "frames", "gravity", "particles", "materials")
-
-
-@pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
-    return tmp_path
 
 
 def write_foreign(frames: int = 32, every: int = 1, **changes) -> Path:
@@ -121,31 +113,6 @@ def test_strict_refuses_what_does_not_match(capsys):
     assert "turn the data" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["rollout", "goop", "--data", ".", "--stride", "2/3"], "--stride 2/3: give a whole number"),
-        (["rollout", "goop", "--data", ".", "--materials", "big"], "--materials big: give DATA=MODEL pairs"),
-        (["rollout", "goop", "--materials", "big=sand"], "--materials, --stride and --strict are about recorded data"),
-        (["compare", "goop", "--data", ".", "--stride", "0"], "--stride 0: give a whole number"),
-        (["zoo", "match", "."], "--stride"),
-        (["fit", "--start_from", "goop", "--data.path", ".", "--materials", "a=b=c"], "--materials a=b=c: give"),
-        (["fit", "--data.path", ".", "--stride", "2"], "--stride is of --start_from MODEL"),
-    ],
-)
-def test_options_are_refused_before_torch_is_imported(words, message):
-    words = [*words, "--stride", "1/0"] if words[0] == "zoo" else words
-    code = f"import sys; from nmpm.cli import main; main({words!r}); sys.exit('torch' in sys.modules)"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert message in run.stderr
-
-
-TINY = [
-    *("--trainer.max_steps", "2", "--data.batch_size", "2"),
-    *("--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false", "--model.unroll", "1"),
-]
-
-
 def test_a_fine_tuning_needs_no_configuration_and_its_run_needs_no_zoo(capsys, monkeypatch):
     data = write_foreign()
     assert main(["fit", "--start_from", "goop", "--data.path", str(data), *TINY]) == 0
@@ -186,22 +153,8 @@ def test_a_configuration_s_form_is_left_out_with_a_line(monkeypatch):
     built = []
     monkeypatch.setattr(EmulatorCLI, "_run_subcommand", lambda cli, _: built.append(cli))
     words = ["fit", "--config", "tutorial.yaml", "--start_from", "multimaterial", "--data.path", str(write_foreign())]
-    assert (
-        main(
-            [
-                *words,
-                *TINY,
-                "--model.mirror=[]",
-                "--model.frames",
-                "16",
-                "--materials",
-                "steel=sand",
-                "--stride",
-                "1/16",
-            ]
-        )
-        == 0
-    )
+    words += ["--model.mirror=[]", "--model.frames", "16", "--materials", "steel=sand", "--stride", "1/16"]
+    assert main([*words, *TINY]) == 0
     (cli,), recipe = built, Zoo.load("multimaterial").emulator.recipe
     assert "Left out of the configuration, as multimaterial has its own: model.cells, model.frames" in str(cli.matched)
     assert cli.model.emulator.recipe.processor == recipe.processor

@@ -65,16 +65,14 @@ def test_a_shared_scene_is_plain_data_whose_name_leads_nowhere(change, said, tmp
     assert [path.name for path in tmp_path.rglob("*")] == ["inner", "mine.yaml"]
 
 
-def test_a_preview_is_a_picture_and_nothing_else(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_preview_is_a_picture_and_nothing_else(tmp_path):
     assert main(["simulate", "sandramps", "--frames", "6", "--preview", "look.png"]) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["look.png"]
     with Image.open("look.png") as picture:
         assert min(picture.size) > 200
 
 
-def test_a_preview_may_be_a_file_for_other_programs(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_preview_may_be_a_file_for_other_programs():
     assert main(["simulate", "sandramps", "--frames", "6", "--preview", "look.vtkhdf"]) == 0
     split = Split(Path("look.vtkhdf"))
     assert (len(split), split.frames(0)) == (1, 7)

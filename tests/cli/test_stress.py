@@ -23,8 +23,6 @@ def test_scenes_of_another_simulator_are_matched(capsys):
     assert "sand -> goop" in said.err
     assert main(["stress", "goop", "--preset", "goop", "--groups", "poison"]) == 0
     assert "as follows" not in capsys.readouterr().out
-    assert main(["stress", "goop", "--stride", "2"]) == 1
-    assert "--stride and --strict are about the scenes of a --preset" in capsys.readouterr().err
 
 
 def test_a_table_for_people(capsys):

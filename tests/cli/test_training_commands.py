@@ -389,36 +389,14 @@ def test_too_little_data_is_refused_at_once_unless_the_length_of_the_training_is
     assert not Path("runs").exists()
 
 
-FACTS = ["--data.gravity", "[0.0, -9.81]", "--data.boundary", "[wall, wall]"]
 PRINTING = {
-    "fit": [
-        "fit",
-        *WATERDROP,
-        "--data.path",
-        "my data",
-        *FACTS,
-        "--model.cells",
-        "8",
-        "--trainer.default_root_dir=my runs",
-    ],
-    "init": ["init", "my data", "--out", "my data.yaml"],
-    "convert": ["convert", "my data", "my copy"],
-    "simulate": [
-        "simulate",
-        "goop",
-        "--frames",
-        "3",
-        "--train",
-        "0",
-        "--valid",
-        "0",
-        "--test",
-        "1",
-        "--out",
-        "my goop",
-    ],
-    "rollout": ["rollout", "goop", "--frames", "3", "--particles", "30", "--out", "my rollout.h5"],
-    "zoo match": ["zoo", "match", "my data", "--root", "zoo"],
+    "fit": "fit --config waterdrop.yaml --data.path 'my data' --data.gravity '[0.0, -9.81]' --model.cells 8"
+    f" --data.boundary '[wall, wall]' '--trainer.default_root_dir=my runs' {shlex.join(TINY)}",
+    "init": "init 'my data' --out 'my data.yaml'",
+    "convert": "convert 'my data' 'my copy'",
+    "simulate": "simulate goop --frames 3 --train 0 --valid 0 --test 1 --out 'my goop'",
+    "rollout": "rollout goop --frames 3 --particles 30 --out 'my rollout.h5'",
+    "zoo match": "zoo match 'my data' --root zoo",
 }
 """Commands that print further commands."""
 
@@ -430,7 +408,7 @@ def test_every_command_that_is_printed_runs(words, make_dataset, monkeypatch, ca
     shutil.copytree(shipped_folder("zoo") / "goop", Path("zoo", "goop"))
     sweep = "{scenes: 1, timing: {rounds: 1, frames: 4}, models: {precision: [float32], batch: [1]}}"
     monkeypatch.setattr("nmpm.evaluation.trade.shipped_sweep_text", lambda _: sweep)
-    assert main(words) == 0
+    assert main(shlex.split(words)) == 0
     printed = printed_commands(capsys.readouterr().out)
     assert printed
     while printed:

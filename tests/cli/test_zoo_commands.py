@@ -1,16 +1,14 @@
 import pytest
 import yaml
 
-from nmpm._support.shipped import shipped_folder
+from nmpm._support.shipped import shipped_folder, user_home
 from nmpm.cli import main
 from nmpm.zoo import Zoo
 
 
-@pytest.fixture(autouse=True)
-def home(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("NMPM_HOME", str(tmp_path / "home"))
-    return tmp_path / "home"
+@pytest.fixture
+def home():
+    return user_home()
 
 
 def copy(name, folder):
