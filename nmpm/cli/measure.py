@@ -226,21 +226,10 @@ class _Sweep(DeviceOptions, StrictReadingOptions, FactOptions):
             raise ConfigError("There is nothing to measure: give --models, or settings of the simulator.")
         for line in sweep.models.left_out(device) if loaded else []:
             sys.stdout.write(f"{line}\n")
-        store, rest = trade.Store(out), ""
-        errors_first = (
-            scenes.preset is None
-            and not (times or config or members)
-            and trade.estimate_rest(choices, scenes, sweep, store)[0] > 0
-        )
+        store, left = trade.Store(out), (0, 0.0)
         try:
-            if errors_first:
-                points = trade.measure_untimed(trade.first_forms(choices), scenes, sweep, store, self.command)
-                count, seconds = trade.estimate_rest(choices, scenes, sweep, store)
-                rest = (
-                    f"next: times, and the models in other forms: {counted(count, 'measurement')}, about"
-                    f" {timedelta(seconds=max(1, round(seconds)))}\n"
-                    f"  {shlex.join(['nmpm', self.command, *self.words, '--times'])}\n"
-                )
+            if scenes.preset is None and not (times or config or members):
+                points, left = trade.measure_errors_first(choices, scenes, sweep, store, self.command)
             else:
                 points = trade.measure(choices, scenes, sweep, store, self.command)
         except KeyboardInterrupt:
@@ -248,13 +237,18 @@ class _Sweep(DeviceOptions, StrictReadingOptions, FactOptions):
                 f"interrupted; what is measured is in {out}, and the same command goes on."
             ) from None
         console = Console()
-        shown = likely_points(points) if self.command == "trade" and not errors_first else points
+        shown = likely_points(points) if self.command == "trade" and not left[0] else points
         console.print(summary_table(shown, points, scenes))
         for line in report_lines(points):
             console.print(line, highlight=False, soft_wrap=True)
         paths = write_report(out, self.command, points, scenes, self.style and STYLES[self.style])
         sys.stderr.write(f"wrote {', '.join(map(str, paths))}\n")
-        sys.stdout.write(rest)
+        if left[0]:
+            sys.stdout.write(
+                f"next: times, and the models in other forms: {counted(left[0], 'measurement')}, about"
+                f" {timedelta(seconds=max(1, round(left[1])))}\n"
+                f"  {shlex.join(['nmpm', self.command, *self.words, '--times'])}\n"
+            )
 
     def _check_materials(self, models: Mapping[str, Pretrained]) -> None:
         """Raise ConfigError if no model has the materials that an option names; those that have are matched by them."""

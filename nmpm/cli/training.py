@@ -104,15 +104,12 @@ class Training(StrictReadingOptions, ThreadsOptions):
         options, note = expand_run(command, own)
         values = parser.parse_args([word for one in own for word in _checked_words(one)])
         cls(**{one.name: values[one.name] for one in fields(cls)})
-        trusts = values["trust_config"]
-        if not trusts:
-            check_trust(own, options)
         options = [one for one in options if one.name != OPTION]
         check_options(options)
         options = add_configuration(options) if command == "fit" else options
         from nmpm.cli.run_training import run_command
 
-        trusted = None if trusts or not note else names_in(own)
+        trusted = None if values["trust_config"] or not note else names_in(own)
         return run_command([command, *(_REPLACED.get(word, word) for word in map(str, options))], note, trusted)
 
 
@@ -334,14 +331,6 @@ def names_in(options: Sequence[Option]) -> frozenset[str]:
     return frozenset(NAME.findall("\n".join([*map(str, options), *configs])))
 
 
-def check_trust(own: Sequence[Option], options: Sequence[Option]) -> None:
-    """Raise ConfigError if the configuration of a run, which options have beside the user's own, names foreign code."""
-    for name, value in options:
-        if name == "--config" and value and Option(name, value) not in own:
-            for foreign in foreign_names(read_config(Path(value)), names_in(own)):
-                raise ConfigError(f"{value} {trust_advice(foreign)}")
-
-
 def forget_unused_slurm() -> None:
     """Remove SLURM's number of tasks from the environment of a process that srun has not started as one of them.
 
@@ -408,7 +397,7 @@ def expand_run(command: str, options: Sequence[Option]) -> tuple[list[Option], s
 
     Raises:
         UsageError: if `--resume` lacks the folder, or `nmpm fit` gets one without `--resume`.
-        ConfigError: if the folder, its configuration or its checkpoint does not exist.
+        ConfigError: if the folder, its configuration or its checkpoint does not exist, or it names foreign code.
     """
     runs = [one.name for one in options if not one.name.startswith("-")]
     if command == "fit":
@@ -429,6 +418,9 @@ def expand_run(command: str, options: Sequence[Option]) -> tuple[list[Option], s
     if not (root / CONFIG).is_file():
         raise ConfigError(f"{run} is not the folder of a run: there is no {CONFIG} in it.")
     config = read_config(root / CONFIG)
+    if Option(OPTION) not in options:
+        for foreign in foreign_names(config, names_in(options)):
+            raise ConfigError(f"{root / CONFIG} {trust_advice(foreign)}")
     names = {option.name for option in others}
     implied = [] if ROOT in names else [Option(ROOT, run)]
     if names & {"--data.path", "--data.name"} and _stated_value(config, "data.reading"):

@@ -21,7 +21,7 @@ from nmpm.emulator.prescribed import with_predicted
 from nmpm.errors import NmpmError
 from nmpm.evaluation.machine import clock_for, describe_device, is_machine_failure, one_thread, peak_bytes
 from nmpm.evaluation.prediction_errors import Measures, instability, measure_errors, squared_errors
-from nmpm.evaluation.trade.choices import Choice, digest
+from nmpm.evaluation.trade.choices import Choice, digest, first_forms
 from nmpm.evaluation.trade.ranking import Point, Times
 from nmpm.evaluation.trade.scenes import Scenes
 from nmpm.evaluation.trade.sweep import Sweep, Timing
@@ -100,6 +100,20 @@ def estimate_rest(choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store
         count += lacking + untimed
         total += lacking * (predicting + measuring) + untimed * choice.batch * share * predicting
     return count, total
+
+
+def measure_errors_first(
+    choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store: Store, title: str = "trade"
+) -> tuple[list[Point], tuple[int, float]]:
+    """The errors of each model's first form, as long as the store lacks any measurement; else all, as `measure`.
+
+    Returns:
+        The points; and how many measurements are left, with about how many seconds they take: 0 if there are none.
+    """
+    if not estimate_rest(choices, scenes, sweep, store)[0]:
+        return measure(choices, scenes, sweep, store, title), (0, 0.0)
+    points = measure_untimed(first_forms(choices), scenes, sweep, store, title)
+    return points, estimate_rest(choices, scenes, sweep, store)
 
 
 def _point(scenes: Scenes, choice: Choice, rows: Sequence[Mapping[str, Any]], times: Times) -> Point:

@@ -25,7 +25,8 @@ from torch.export import Dim, ExportedProgram
 from nmpm._support import __version__
 from nmpm._support.atomic import atomic_write
 from nmpm._support.messages import install
-from nmpm.errors import ConfigError
+from nmpm._support.progress import progress_bar
+from nmpm.errors import ConfigError, DataError
 from nmpm.transfer import without_kernels
 from nmpm.zoo.export.parts import VARYING, Part, Value
 
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
 OPSET = 20  # the first whose GridSample takes 3-D
+TOLERANCE = 1e-3
+"""Largest difference, in cells, that a file may have from its model over one call."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,25 @@ class Format:
 
     write: Callable[[Part, Mapping[str, str], Path], None]
     run: Callable[[Path, Mapping[str, Tensor]], tuple[Tensor, ...]]
+
+    def write_verified(self, part: Part, metadata: Mapping[str, str], path: Path) -> float:
+        """Write a part, and compare the file with it; the largest difference, see `difference`.
+
+        Raises:
+            ConfigError: as `write`.
+            DataError: if they differ by more than `TOLERANCE`; the file is deleted.
+        """
+        with progress_bar(f"Writing {path.name}", 2) as step:
+            self.write(part, metadata, path)
+            step(f"Comparing {path.name} with the model")
+            difference = self.difference(part, path, batch=1, count=300)
+        if not difference <= TOLERANCE:
+            path.unlink()
+            raise DataError(
+                f"Verification failed: {path} differed from the model by {difference:.3g} cells in one call, more than"
+                f" {TOLERANCE:g}; the file was deleted. Try the other --format."
+            )
+        return difference
 
     def difference(self, part: Part, path: Path, batch: int, count: int, seed: int = 0) -> float:
         """The largest difference between a written file's outputs and the part's own, on random inputs.
