@@ -19,6 +19,7 @@ import pytest
 
 from nmpm import Zoo
 from nmpm._support.messages import install
+from nmpm.viz.page import make_page
 from tests.conftest import wait_until
 from tests.test_site import load_hook
 
@@ -38,7 +39,8 @@ def open_page(visit):
 
 
 def test_from_the_file_system_the_page_says_what_it_needs(hook, open_page, tmp_path):
-    (tmp_path / "index.html").write_text(hook.page(Zoo.load(hook.MODEL), RUNTIME), encoding="utf-8")
+    page = make_page("onnx", hook.described(Zoo.load(hook.MODEL), RUNTIME))
+    (tmp_path / "index.html").write_text(page, encoding="utf-8")
     page = open_page((tmp_path / "index.html").as_uri())
     assert "python -m http.server" in page.locator("#start").inner_text()
     assert page.locator("#start").is_disabled()

@@ -7,7 +7,6 @@ visitor presses Start, from the folder `onnxruntime_web` of mkdocs.yml, and take
 from __future__ import annotations
 
 import base64
-import json
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -19,8 +18,8 @@ from torch import Tensor
 
 from nmpm import Zoo
 from nmpm.play.limits import Limits
-from nmpm.play.page import fill, scripts
 from nmpm.play.pictures import page_scene
+from nmpm.viz.page import make_page, read_asset
 from nmpm.zoo import Pretrained
 from nmpm.zoo.export import FORMATS, Step, description
 
@@ -34,8 +33,6 @@ RUNTIME = (
     ("ort-wasm-simd-threaded.wasm", "sha384-vjBJ1z7qrhkTyYsNqKeF6c7N+nOJSU94czEo+tvZcu8G75JparGq9kB+kTnEUNVM"),
 )
 """Files of `VERSION` of the npm package onnxruntime-web (its smallest build), with their subresource integrity."""
-HERE = Path(__file__).parent / "play_page"
-PLAY_SCRIPTS = ("stage.js", "bodies.js", "pointer.js")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -50,18 +47,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def page_files(runtime: str) -> dict[str, str | bytes]:
     """The page and what it loads, by file name; `runtime` is the URL of the folder of ONNX Runtime's files."""
     model = Zoo.load(MODEL)
-    worker = (HERE / "worker.js").read_text(encoding="utf-8")
-    return {"index.html": page(model, runtime), "worker.js": worker, "model.onnx": exported(model)}
-
-
-def page(model: Pretrained, runtime: str) -> str:
-    """The page's text, with the viewer's scripts for drawing and those of `nmpm play` for the pointer."""
-    own = (HERE / "player.js").read_text(encoding="utf-8")
-    contents = {
-        "/*SCENE*/": json.dumps(described(model, runtime)),
-        "/*SCRIPT*/": f"{scripts(PLAY_SCRIPTS)}\n{own}",
-    }
-    return fill((HERE / "page.html").read_text(encoding="utf-8"), contents)
+    page = make_page("onnx", described(model, runtime))
+    return {"index.html": page, "worker.js": read_asset("worker.js"), "model.onnx": exported(model)}
 
 
 def described(model: Pretrained, runtime: str) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from nmpm.colours import hex_code, material_colours
 from nmpm.obstacles import Body
 from nmpm.scene import Scene
-from nmpm.viz.viewer.page import ABSENT, STEPS, colour_scale, quantize
+from nmpm.viz.page import ABSENT, STEPS, colour_scale, quantize
 
 EMULATOR, SIMULATOR, COLOURS = 0, 1, 2
 

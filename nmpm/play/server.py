@@ -13,8 +13,8 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from nmpm.play.page import page, policy
 from nmpm.play.session import MOST_BYTES, Session
+from nmpm.viz.page import make_page
 
 HOST = "127.0.0.1"
 TICK = 1 / 60
@@ -107,7 +107,7 @@ class PlayServer:
             known = (origins or [""])[0] in (f"http://{here}", f"http://localhost:{self.port}")
             return None if known else connection.respond(HTTPStatus.FORBIDDEN, "Another page may not play here.\n")
         if secrets.compare_digest(path, f"/{self.token}/".encode()):
-            return _html(page())
+            return _html(make_page("play", {}))
         return connection.respond(HTTPStatus.NOT_FOUND, "There is no such page: the address needs its token.\n")
 
 
@@ -125,6 +125,13 @@ def _html(text: str) -> Response:
         }
     )
     return Response(HTTPStatus.OK, HTTPStatus.OK.phrase, headers, body)
+
+
+def policy() -> str:
+    """The page's content security policy: nothing from elsewhere, and no connection but to where it came from."""
+    rules = ("default-src 'none'", "script-src 'unsafe-inline'", "style-src 'unsafe-inline'", "img-src data:")
+    closed = ("base-uri 'none'", "form-action 'none'", "frame-ancestors 'none'")
+    return "; ".join((*rules, "connect-src 'self'", *closed))
 
 
 async def play(server: PlayServer, announce: Callable[[str], object]) -> None:

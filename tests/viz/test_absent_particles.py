@@ -15,8 +15,9 @@ from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.particles import Window
 from nmpm.viz import write_animation, write_snapshots
 from nmpm.viz.files import combine, read_labelled
+from nmpm.viz.page import ABSENT, quantize
 from nmpm.viz.panel import PanelRenderer
-from nmpm.viz.viewer.page import ABSENT, ViewerPage, quantize
+from nmpm.viz.viewer import ViewerPage
 from tests.scenes import box, cloud, emulator_of, silenced, with_obstacle
 
 SCENE = box(obstacles=True, moving_obstacles=True, gravity=(0.0, 0.0))

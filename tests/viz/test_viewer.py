@@ -12,7 +12,7 @@ from nmpm.cli import main
 from nmpm.data.format import Trajectory, write_metadata, write_split
 from nmpm.errors import ConfigError, DataError
 from nmpm.viz import LabelledTrajectories
-from nmpm.viz.viewer.page import STEPS, pack_positions, quantize
+from nmpm.viz.page import STEPS, pack_positions, quantize
 from tests.made_up import made_up_metadata, made_up_trajectory
 
 
@@ -163,7 +163,7 @@ def test_further_members_are_packed_coarsely_and_thinned_out_beyond_a_size(falli
     assert np.all(np.abs(low + steps * (high - low) / 65535 - shown - 0.01) <= 16 * (high - low) / STEPS)
     assert page["bands"]["stride"] == 1
     assert len(page["curves"][0]["members"]) == 2
-    monkeypatch.setattr("nmpm.viz.viewer.page.MEMBER_BYTES", shown.size)  # half of what it takes
+    monkeypatch.setattr("nmpm.viz.viewer.MEMBER_BYTES", shown.size)  # half of what it takes
     thinned = description(view(ensemble))
     assert thinned["bands"]["stride"] == 2
     np.testing.assert_array_equal(unpack(thinned["members"][0]["positions"], shown[:, ::2].shape), steps[:, ::2])

@@ -1,5 +1,11 @@
 // Playing: the connection to the server, the controls, and the figures.
 
+import { Pointer } from "./aiming.js";
+import { MODES } from "./drawing.js";
+import { colourLegend } from "./legend.js";
+import { element, scene } from "./scene.js";
+import { COLOURS, EMULATOR, SIMULATOR, Stage } from "./stage.js";
+
 const ICONS = { pause: "M3 2 H6.5 V14 H3 Z M9.5 2 H13 V14 H9.5 Z", play: "M3.5 1.5 L14 8 L3.5 14.5 Z" };
 const PACES = [1, 2, 4];
 const TURN = Math.PI / 12;

@@ -61,7 +61,7 @@ const twoBytes = (number) => [number & 255, number >> 8];
 const textBytes = (text) => [...text].map((letter) => letter.charCodeAt(0));
 
 /** An animation that is played again and again, frame by frame. */
-class Gif {
+export class Gif {
   constructor(width, height) {
     this.size = [...twoBytes(width), ...twoBytes(height)];
     const again = [0x21, 0xff, 11, ...textBytes("NETSCAPE2.0"), 3, 1, 0, 0, 0];

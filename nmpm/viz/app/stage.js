@@ -1,10 +1,14 @@
 // What is drawn: the emulator's panel, the simulator's beside it, the bodies, and the frames that come in.
 
-const element = (id) => document.getElementById(id);
-const THEME_COLOURS = ["page", "text", "faint", "line", "inside", "wall", "ghost", "accent"];
-const MOST_PIXELS = 2; // along each axis, to a pixel of the page
+import { drawBody } from "./bodies.js";
+import { Camera, panelRectangles } from "./camera.js";
+import { DISC_DIAMETER, Drawing, MODES, inSpace } from "./drawing.js";
+import { MOST_PIXELS, THEME_COLOURS, element, readColour, scene } from "./scene.js";
+
 const HEAD = 26; // pixels above each panel, for its label
-const [EMULATOR, SIMULATOR, COLOURS] = [0, 1, 2];
+export const EMULATOR = 0;
+export const SIMULATOR = 1;
+export const COLOURS = 2;
 
 /** The inverse of a 4 × 4 matrix stored by columns. */
 function inverse(matrix) {
@@ -37,7 +41,7 @@ class Film {
   }
 }
 
-class Stage {
+export class Stage {
   constructor() {
     const canvas = element("scene");
     this.canvas = canvas;

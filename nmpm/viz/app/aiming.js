@@ -1,10 +1,13 @@
 // The pointer: throws blocks, pours, drags and turns bodies, and in 3-D the view.
 
+import { holdOf } from "./bodies.js";
+import { element, scene } from "./scene.js";
+
 const FULL_THROW = 0.5; // share of the fastest speed that the model knows, for an arrow as long as the box
 const MOVES = 30; // milliseconds between two messages of a drag
 const SLACK = 8; // pixels around a body that hold it, too
 
-class Pointer {
+export class Pointer {
   /** @param send Sends a command; @param choice {tool, material} as chosen on the page. */
   constructor(stage, send, choice) {
     Object.assign(this, { stage, send, choice, action: null, moved: 0 });

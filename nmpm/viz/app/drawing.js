@@ -1,5 +1,7 @@
 // Drawing with WebGL: particles as discs (shaded as balls in 3-D), walls as filled boxes, floor and frame as lines.
 
+import { readColour, scaleEnds, scene } from "./scene.js";
+
 const POINTS = `#version 300 es
 in vec3 position, previous, reference, material;
 in float field;
@@ -35,14 +37,14 @@ const LINES = `#version 300 es
 in vec3 position; uniform mat4 view; void main() { gl_Position = view * vec4(position, 1.0); }`;
 const FLAT = `#version 300 es
 precision highp float; uniform vec4 plain; out vec4 pixel; void main() { pixel = plain; }`;
-const MODES = { material: 0, speed: 1, error: 2, plain: 3, field: 4 };
+export const MODES = { material: 0, speed: 1, error: 2, plain: 3, field: 4 };
 /** Diameter of a disc in spacings, as in panel.py: discs of neighbours overlap, also where a model spreads them unevenly. */
-const DISC_DIAMETER = 2.2;
+export const DISC_DIAMETER = 2.2;
 const FLOOR_TILES = 10;
 /** Which positions besides the particles' own a mode reads: 1 of the frame before, 2 of the reference. */
 const OTHERS = { [MODES.speed]: 1, [MODES.error]: 2 };
 
-function compile(gl, vertex, fragment, attributes) {
+export function compile(gl, vertex, fragment, attributes) {
   const program = gl.createProgram();
   for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
     const shader = gl.createShader(kind);
@@ -59,7 +61,7 @@ function compile(gl, vertex, fragment, attributes) {
 }
 
 /** Draws particles and walls on a canvas. */
-class Drawing {
+export class Drawing {
   /** @param colours RGB bytes of the particles; @param obstacles 16-bit positions, as those of trajectories. */
   constructor(canvas, colours, obstacles) {
     // Discs are smooth by their shader and walls lie along pixels; in 3-D it would cost software renderers most of a frame.
@@ -202,8 +204,8 @@ class Drawing {
   }
 }
 
-const inSpace = (vector) => [...vector, 0].slice(0, 3);
-const rectangle = ([[x0, x1], [y0, y1]]) => [[x0, y0, 0], [x1, y0, 0], [x0, y1, 0], [x1, y1, 0]];
+export const inSpace = (vector) => [...vector, 0].slice(0, 3);
+export const rectangle = ([[x0, x1], [y0, y1]]) => [[x0, y0, 0], [x1, y0, 0], [x0, y1, 0], [x1, y1, 0]];
 
 /** Points of a box's floor from shares along its two horizontal axes. */
 const floorOf = (box) => (...shares) => {
@@ -216,7 +218,7 @@ const floorOf = (box) => (...shares) => {
 };
 
 /** The twelve edges of a box, as pairs of corners. */
-function edges(box) {
+export function edges(box) {
   const corners = [];
   for (let axis = 0; axis < 3; axis++)
     for (let side = 0; side < 4; side++)

@@ -1,6 +1,11 @@
 // Members of an ensemble: which of them are drawn and how, and charts of their derived quantities.
 
-class Ensemble {
+import { digits } from "./chart.js";
+import { Density } from "./density.js";
+import { MODES } from "./drawing.js";
+import { css, element, mix, readColour, scene } from "./scene.js";
+
+export class Ensemble {
   /** @param shown Positions of the member among the trajectories, the last of these; @param further of the others. */
   constructor(drawing, shown, further) {
     this.drawing = drawing;
@@ -89,6 +94,3 @@ class Ensemble {
     return { title: name, bands: tinted, lines, now };
   }
 }
-
-const mix = (first, second, share) => first.map((value, at) => value + share * (second[at] - value));
-const css = (rgb) => `rgb(${rgb.map((value) => Math.round(255 * value))})`;

@@ -1,7 +1,11 @@
 // Where panels lie, and how the box is seen in them: one view for all panels.
 
+import { edges } from "./drawing.js";
+import { ORBIT, flatView, orbitAxes, orbitView } from "./matrices.js";
+import { scene } from "./scene.js";
+
 /** Rectangles (x, y, width, height) of `count` panels, in pixels from the canvas's upper left corner. */
-function panelRectangles(count, width, height, aspect) {
+export function panelRectangles(count, width, height, aspect) {
   let best = null;
   for (let columns = 1; columns <= count; columns++) {
     const rows = Math.ceil(count / columns), w = width / columns, h = height / rows;
@@ -12,11 +16,8 @@ function panelRectangles(count, width, height, aspect) {
     [(i % best.columns) * best.w, Math.floor(i / best.columns) * best.h, best.w, best.h].map(Math.round));
 }
 
-// In 3-D: the first view, half of the camera's vertical angle, and the share of a panel that the box fills.
-const ORBIT = { turn: 0.5, tilt: 0.35, halfAngle: 0.35, filled: 0.96 };
-
 /** The camera: in 2-D it moves and zooms, in 3-D it turns and zooms. */
-class Camera {
+export class Camera {
   constructor() {
     this.reset();
   }

@@ -1,5 +1,8 @@
 // Where an ensemble's members are, in 2-D: the share of them that occupy each cell, as bands; see occupancy.py.
 
+import { compile, rectangle } from "./drawing.js";
+import { readColour, scene } from "./scene.js";
+
 const COVER = `#version 300 es
 in vec3 position; uniform mat4 view; uniform vec2 low, extent; out vec2 at;
 void main() { at = (position.xy - low) / extent; gl_Position = view * vec4(position, 1.0); }`;
@@ -20,7 +23,7 @@ void main() {
   pixel = vec4(colour, tint);
 }`;
 
-class Density {
+export class Density {
   /** @param members 16-bit positions: of the first all, of the others each n-th; in all of them each n-th counts. */
   constructor(gl, members) {
     Object.assign(this, { gl, members });

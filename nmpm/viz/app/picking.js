@@ -1,6 +1,10 @@
 // The pointer over the panels: it turns, moves and zooms the camera, and tells which particle it is at.
 
-class Pointer {
+import { digits } from "./chart.js";
+import { DISC_DIAMETER, inSpace } from "./drawing.js";
+import { element, scene } from "./scene.js";
+
+export class Pointer {
   constructor(viewer) {
     Object.assign(this, { viewer, event: null });
     const canvas = element("scene");

@@ -1,5 +1,11 @@
 // Shows bundles frame by frame while the worker computes the next one; thrown blocks wait for it where they are.
 
+import { Pointer } from "./aiming.js";
+import { MODES } from "./drawing.js";
+import { colourLegend } from "./legend.js";
+import { element, readColour, scene } from "./scene.js";
+import { EMULATOR, Stage } from "./stage.js";
+
 const ICONS = { pause: "M3 2 H6.5 V14 H3 Z M9.5 2 H13 V14 H9.5 Z", play: "M3.5 1.5 L14 8 L3.5 14.5 Z" };
 const PACES = [1, 2, 4], RATE = 60; // frames for each picture, and pictures a second
 const HURRY = 2, MARGIN = 50; // the next bundle is asked for when what is left is shown within HURRY calls and MARGIN ms

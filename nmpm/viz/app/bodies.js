@@ -17,12 +17,12 @@ function bodyCorners(body) {
   return [[-a, -b], [a, -b], [a, b], [-a, b]].map(([p, q]) => [x + c * p - s * q, y + s * p + c * q, 0]);
 }
 
-function drawBody(drawing, body, colour) {
+export function drawBody(drawing, body, colour) {
   drawing.drawCorners(bodyCorners(body), drawing.gl.TRIANGLE_FAN, colour);
 }
 
 /** How a point holds a body: "move", "turn", or nothing; `slack` widens it, for fingers. */
-function holdOf(body, point, slack) {
+export function holdOf(body, point, slack) {
   if (body.kind === "disc")
     return Math.hypot(point[0] - body.centre[0], point[1] - body.centre[1]) < body.radius + slack ? "move" : null;
   const [along, across] = alongRamp(body, point).map(Math.abs);

@@ -1,9 +1,16 @@
 // The viewer: playing, choices, keys, and what is drawn.
 
+import { Camera, panelRectangles } from "./camera.js";
+import { digits, drawCurve, frameAt } from "./chart.js";
+import { DISC_DIAMETER, Drawing, MODES } from "./drawing.js";
+import { Ensemble } from "./ensemble.js";
+import { colourLegend, gravityNote } from "./legend.js";
+import { flatten, multiply } from "./matrices.js";
+import { Pointer } from "./picking.js";
+import { saveFilm, saveGif, savePicture } from "./saving.js";
+import { MOST_PIXELS, THEME_COLOURS, element, inflate, readColour, readField, readTrajectory, scene, undoDifferences } from "./scene.js";
+
 const RATES = [5, 15, 30, 60, 120, 240];
-const MOST_PIXELS = 2; // along each axis, to a pixel of the page: phones have 3, which nobody sees in discs
-const THEME_COLOURS = ["page", "text", "faint", "line", "inside", "wall", "ghost", "accent"];
-const element = (id) => document.getElementById(id);
 
 class Viewer {
   /**

@@ -1,7 +1,10 @@
 // Legends and notes beside the drawing.
 
+import { MODES } from "./drawing.js";
+import { scaleEnds, scene } from "./scene.js";
+
 /** What the colours of particles stand for, as elements and texts. */
-function colourLegend({ colour, mode, fieldIndex }) {
+export function colourLegend({ colour, mode, fieldIndex }) {
   if (colour === "material") {
     return scene.materials.map(({ name, colour: background }) => {
       const entry = document.createElement("span"), dot = document.createElement("i");
@@ -39,7 +42,7 @@ function scaleBar(numbers, unit) {
 }
 
 /** Says where gravity points: an angle from straight down, counterclockwise in radians. */
-function gravityNote(tilt) {
+export function gravityNote(tilt) {
   const note = document.createElement("small"), arrow = document.createElement("i");
   arrow.textContent = "↓";
   arrow.style.transform = `rotate(${-tilt}rad)`;

@@ -1,20 +1,14 @@
-"""The viewer's page: one HTML file without links, for any browser with WebGL 2.
+"""A viewer for browsers: one self-contained HTML page that plays trajectories, drawn by WebGL.
 
-Positions are packed as 16-bit differences from frame to frame, deflated, in base64.
+`view` is what notebooks call; `nmpm view` writes the page to a file.
 """
 
 from __future__ import annotations
 
-import base64
 import html
-import json
-import zlib
-from collections.abc import Mapping
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,22 +17,18 @@ from nmpm.errors import ConfigError
 from nmpm.viz.camera import vertical_axis
 from nmpm.viz.occupancy import CELL, LEVELS, ensemble_colour
 from nmpm.viz.output import check_output, replace_picture
+from nmpm.viz.page import ABSENT, STEPS, colour_scale, make_page, pack_bytes, pack_positions, quantize
 from nmpm.viz.panel import particle_spacing
 from nmpm.viz.quantities import quantity_curves
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
-SCRIPTS = (
-    "data.js", "matrices.js", "drawing.js", "density.js", "layout.js", "curve.js", "legend.js", "ensemble.js",
-    "gif.js", "saving.js", "pointer.js", "viewer.js",
-)  # fmt: skip
-COLOUR_SCALE = "YlGnBu_r"
+__all__ = ["ViewerPage", "page_of_files", "view"]
+
 TOP_PERCENTILE = 99.0
 """Of speeds and errors: what the upper end of the colour scale stands for."""
 FIELD_PERCENTILES = (0.5, 99.5)
 """Of a field's values: what the ends of the colour scale stand for."""
 SAMPLED_FRAMES = 50
-STEPS = 65534
-"""Steps from the lowest to the highest position along an axis: an error of at most 1 / 131068 of the box."""
 MEMBER_STEPS = 16
 """Steps to which positions of further members are rounded: they take half the room, and nobody sees it."""
 MEMBER_BYTES = 2**26
@@ -49,8 +39,46 @@ MOST_LEFT_OUT = 40
 """At least one in so many particles of a further member is on the page."""
 BAND_TINTS = (0.28, 0.5, 0.75)
 """Share of the ensemble's colour in the bands at `LEVELS`; darker than in pictures, where particles lie over them."""
-ABSENT = 65535
-"""Stands for the position of a particle that is not there."""
+
+
+def view(what: LabelledTrajectories | Path | str, truth: Path | str | None = None, every: int = 1) -> ViewerPage:
+    """A page that plays trajectories; as the last expression of a notebook's cell it appears below it.
+
+    Args:
+        what: Labelled trajectories, or a file or folder of data, whose first trajectory (of the tests, if there are
+            any) is shown.
+        truth: Data whose first trajectory starts in the same way; errors are against it.
+        every: Shows every so many frames.
+    """
+    if isinstance(what, LabelledTrajectories):
+        return ViewerPage(what, every)
+    return page_of_files((Path(what), 0), None if truth is None else (Path(truth), 0), every)
+
+
+def page_of_files(
+    shown: tuple[Path, int], truth: tuple[Path, int] | None, every: int = 1, family: str | None = None
+) -> ViewerPage:
+    """A page that plays a trajectory of a file, beside the one that it should be.
+
+    Args:
+        shown: File and index of the trajectory.
+        truth: File and index of what it should be; errors are against it.
+        every: Shows every so many frames.
+        family: Meaning of type ids if metadata.json lacks it.
+
+    Raises:
+        DataError: if a file cannot be read, or the two do not show the same particles.
+        ConfigError: if `every` is below 1.
+    """
+    from nmpm.data.convert import native_file
+    from nmpm.data.format import Split
+    from nmpm.viz.files import combine, read_labelled
+
+    trajectories = read_labelled(Split(native_file(shown[0])), shown[1], family)
+    if truth is not None:
+        reference = read_labelled(Split(native_file(truth[0])), truth[1], family)
+        trajectories = combine(reference, trajectories, (str(truth[0]), str(shown[0])))
+    return ViewerPage(trajectories, every)
 
 
 class ViewerPage:
@@ -70,13 +98,7 @@ class ViewerPage:
     def __init__(self, trajectories: LabelledTrajectories, every: int = 1) -> None:
         if every < 1:
             raise ConfigError(f"every = {every} must be at least 1.")
-        data = json.dumps(_describe(trajectories, every), separators=(",", ":"), allow_nan=False)
-        contents = {
-            "/*STYLE*/": read_asset("style.css"),
-            "/*SCRIPT*/": "\n".join(map(read_asset, SCRIPTS)),
-            "/*DATA*/": data.replace("<", "\\u003c"),  # `</script>` in a text would end the data
-        }
-        self.html = fill_page(read_asset("page.html"), contents)
+        self.html = make_page("view", _describe(trajectories, every))
 
     def write(self, path: Path | str) -> Path:
         """Writes the page to a `.html` file; an existing one is replaced only when the new one is complete.
@@ -95,19 +117,6 @@ class ViewerPage:
         page = html.escape(self.html, quote=True)
         allowed, style = "allow-scripts allow-downloads", "width: 100%; height: 640px; border: 0"
         return f'<iframe srcdoc="{page}" sandbox="{allowed}" style="{style}"></iframe>'
-
-
-def read_asset(name: str, package: str = __package__) -> str:
-    """The text of a file of a package, of the viewer's when left out."""
-    return files(package).joinpath(name).read_text(encoding="utf-8")
-
-
-def fill_page(text: str, contents: Mapping[str, str]) -> str:
-    """A page's text with contents in place of their marks, each of which stands there once."""
-    for mark, content in contents.items():
-        before, after = text.split(mark)
-        text = before + content + after
-    return text
 
 
 def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
@@ -140,12 +149,6 @@ def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
         "fields": [_describe_field(trajectories, name, every) for name in trajectories.fields],
         "curves": _describe_curves(trajectories, every),
     }
-
-
-def colour_scale() -> list[str]:
-    """The scale's colours, as #rrggbb."""
-    scale = np.round(255 * matplotlib.colormaps[COLOUR_SCALE](np.linspace(0, 1, 64))).astype(int).tolist()
-    return [hex_code((red, green, blue)) for red, green, blue, _ in scale]
 
 
 def _describe_motion(trajectories: LabelledTrajectories, positions: dict[str, Floats], every: int) -> dict[str, Any]:
@@ -245,24 +248,3 @@ def _nearly_largest(trajectories: LabelledTrajectories, differences: list[Floats
     lengths = np.sqrt(np.square(shortest).sum(axis=0))
     lengths = lengths[~np.isnan(lengths)]
     return (float(np.percentile(lengths, TOP_PERCENTILE)) if lengths.size else 0.0) or 1.0
-
-
-def quantize(position: Floats, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.uint16]:
-    """Positions (..., D) as multiples of (high - low) / `STEPS` above `low`, (D,) each; NaN as `ABSENT`."""
-    return np.where(np.isnan(position), ABSENT, np.round((position - low) / (high - low) * STEPS)).astype(np.uint16)
-
-
-def pack_positions(steps: NDArray[np.uint16]) -> str:
-    """Packs quantised positions (T, N, D), or other numbers (T, N), with particles drawn in this order.
-
-    All low bytes precede all high bytes, which are mostly the same and so take next to no room.
-    """
-    change = steps.copy()
-    change[1:] -= steps[:-1]  # (modulo 65536)
-    flat = change.reshape(-1)
-    return pack_bytes(np.concatenate([flat & 0xFF, flat >> 8]).astype(np.uint8))
-
-
-def pack_bytes(values: NDArray[np.uint8]) -> str:
-    """Deflated bytes as base64 text."""
-    return base64.b64encode(zlib.compress(values.tobytes(), 6)).decode("ascii")

@@ -1,5 +1,8 @@
 // Saving what is shown: a picture (PNG), or all frames as a film (WebM) or an animation (GIF).
 
+import { Gif } from "./gif.js";
+import { css, element, scene } from "./scene.js";
+
 const HEAD = 30; // pixels above the panels, for the title
 const GIF_WIDTH = 720, GIF_PICTURES = 250, GIF_RATE = 25; // at most so many pixels, pictures, and pictures per second
 
@@ -33,7 +36,7 @@ function compose(viewer, canvas) {
   context.fillText(element("time").textContent.split(", ").at(-1), shown.clientWidth - 12, 20);
 }
 
-function savePicture(viewer) {
+export function savePicture(viewer) {
   const canvas = document.createElement("canvas");
   viewer.draw(); // the drawing is lost when the browser has shown it
   compose(viewer, canvas);
@@ -41,7 +44,7 @@ function savePicture(viewer) {
 }
 
 /** Plays from the first frame to the last and records what is seen; once more ends it early. */
-function saveFilm(viewer) {
+export function saveFilm(viewer) {
   if (viewer.recorder) return viewer.recorder.stop();
   const canvas = document.createElement("canvas"), parts = [], button = element("film");
   viewer.stopAt(0);
@@ -69,7 +72,7 @@ function saveFilm(viewer) {
 }
 
 /** All frames as a GIF, at the chosen speed; once more ends it early. */
-async function saveGif(viewer) {
+export async function saveGif(viewer) {
   if (viewer.animating) return (viewer.animating = false);
   const canvas = document.createElement("canvas"), small = document.createElement("canvas");
   const every = Math.ceil(Math.max(viewer.rate / GIF_RATE, viewer.frames / GIF_PICTURES)), last = viewer.frame;

@@ -1,6 +1,8 @@
 // The chart under the time slider.
 
-const digits = (value, count = 2) =>
+import { css, scene } from "./scene.js";
+
+export const digits = (value, count = 2) =>
   value === 0 || Math.abs(value) >= 1e-3 ? String(Number(value.toPrecision(count))) : value.toExponential(1);
 const BESIDE = { left: 52, right: 10, top: 18, bottom: 17 }; // the axes, in pixels
 
@@ -15,7 +17,7 @@ function roundTicks(low, high, most) {
  * Draws curves against frames, with a line at the one that is shown.
  * @param chart {title, bands: [{low, high, colour}], lines: [{values, colour, dashed}]}, of all frames.
  */
-function drawCurve(canvas, { title, bands, lines }, frame, theme) {
+export function drawCurve(canvas, { title, bands, lines }, frame, theme) {
   const ratio = devicePixelRatio, width = canvas.clientWidth, height = canvas.clientHeight;
   canvas.width = width * ratio;
   canvas.height = height * ratio;
@@ -62,7 +64,7 @@ function drawCurve(canvas, { title, bands, lines }, frame, theme) {
 }
 
 /** The frame under a point of the curve. */
-function frameAt(canvas, offset) {
+export function frameAt(canvas, offset) {
   const share = (offset - BESIDE.left) / (canvas.clientWidth - BESIDE.left - BESIDE.right);
   return Math.round(Math.min(1, Math.max(0, share)) * (scene.frames - 1));
 }
