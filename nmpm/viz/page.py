@@ -17,7 +17,7 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm._support.colours import hex_code
+from nmpm.colours import hex_code
 from nmpm.viz.trajectories import Floats
 
 COLOUR_SCALE = "YlGnBu_r"
