@@ -30,12 +30,12 @@ PROBE = """() => {
     const method = object[name].bind(object);
     object[name] = (...values) => { before(...values); return method(...values); };
   };
-  wrap(play.pointer, "send", ({ do: what }) => { if (what === "move") probe.waiting.push(performance.now()); });
+  wrap(play, "send", ({ do: what }) => { if (what === "move") probe.waiting.push(performance.now()); });
   wrap(play, "read", ({ bodies }) => { if (bodies) probe.answered.push(probe.waiting.shift()); });
-  wrap(play, "take", (data) => {
-    if (new Uint32Array(data, 0, 1)[0] === EMULATOR) probe.arrived.push(...probe.answered.splice(0));
+  wrap(play, "takeFrame", (predictor) => {
+    if (predictor === 0) probe.arrived.push(...probe.answered.splice(0));
   });
-  wrap(play, "drawnAt", () => {
+  wrap(play, "onDrawn", () => {
     if (play.picture === play.acknowledged) return;
     const now = performance.now();
     probe.drawn.push(now);
@@ -91,7 +91,7 @@ def measure(page: Page, server: int, milliseconds: float) -> None:
         before = processor_seconds(server)
         page.wait_for_timeout(milliseconds)
         spent = processor_seconds(server) - before
-        result = page.evaluate("({...probe, count: play.stage.films[0].count})")
+        result = page.evaluate("({...probe, count: play.films[0].position.length / play.camera.centre.length})")
         page.evaluate("clearInterval(window.moving)")
         page.mouse.up()
         print(row(name, result, spent, milliseconds / 1000), flush=True)
@@ -105,7 +105,7 @@ def restart(page: Page) -> None:
 
 def press(page: Page, point: list[float]) -> list[float]:
     """Press the pointer at a point of the scene; where that is in the window."""
-    x, y = page.evaluate("(point) => play.stage.pixelOf(point)", point)
+    x, y = page.evaluate("(point) => play.pixelOf(point).slice(0, 2)", point)
     box = page.locator("#scene").bounding_box() or {}
     at = [box["x"] + x, box["y"] + y]
     page.mouse.move(*at)
@@ -115,7 +115,7 @@ def press(page: Page, point: list[float]) -> list[float]:
 
 def drag(page: Page) -> None:
     """Begin to move the first body about."""
-    page.evaluate(MOVE_ABOUT, press(page, page.evaluate("play.stage.bodies[0].centre")))
+    page.evaluate(MOVE_ABOUT, press(page, page.evaluate("play.bodies[0].centre")))
 
 
 def pour(page: Page) -> None:

@@ -35,7 +35,7 @@ def hook():
 
 @pytest.fixture
 def open_page(visit):
-    return lambda address: visit(address, "window.player && player.stage.drawn > 0", 600, 600)
+    return lambda address: visit(address, "window.session && session.page.drawn > 0", 600, 600)
 
 
 def test_from_the_file_system_the_page_says_what_it_needs(hook, open_page, tmp_path):
@@ -94,7 +94,7 @@ def numbers(page, what):
 
 def at(page, point):
     """Pixels of the window at a point of the scene."""
-    x, y = page.evaluate(f"player.stage.pixelOf({json.dumps(point)})")
+    x, y, *_ = page.evaluate(f"session.page.pixelOf({json.dumps(point)})")
     box = page.locator("#scene").bounding_box()
     return box["x"] + x, box["y"] + y
 
@@ -104,32 +104,32 @@ def test_the_page_plays_as_python_does_and_takes_blocks(hook, address, open_page
     page = open_page(address)
     page.click("#play")
     page.click("#start")
-    wait_long(page, "player.next")
+    wait_long(page, "session.next")
     model = Zoo.load(hook.MODEL)
     state, bounds = model.example(hook.SEED), np.array(model.scene.bounds)
     frames, count = model.emulator.frames, state.position.shape[1]
     expected = model.rollout(state, frames)[0].numpy()
-    first = numbers(page, "player.next.positions").reshape(frames, count, 2)
+    first = numbers(page, "session.next.positions").reshape(frames, count, 2)
     assert np.abs(first - expected).max() < CELLS * min(model.emulator.grid.spacing)
 
     page.click("#step")
-    assert page.evaluate("[player.frame, player.index, player.bundle.count]") == [1, 0, count]
+    assert page.evaluate("[session.frame, session.index, session.bundle.count]") == [1, 0, count]
     low = bounds[:, 0] + 0.1
     page.mouse.move(*at(page, low.tolist()))
     page.mouse.down()
     page.mouse.move(*at(page, (low + np.array((0.1, 0.2))).tolist()), steps=3)
     page.mouse.up()
-    assert page.evaluate("player.waiting.length") == 1
+    assert page.evaluate("session.waiting.length") == 1
     page.click("#play")
-    wait_long(page, f"player.bundle.count > {count}")
-    assert page.evaluate("player.waiting.length") == 0
-    wait_long(page, f"player.frame > {6 * frames}")
-    shown = numbers(page, "player.bundle.positions").reshape(frames, -1, 2)
+    wait_long(page, f"session.bundle.count > {count}")
+    assert page.evaluate("session.waiting.length") == 0
+    wait_long(page, f"session.frame > {6 * frames}")
+    shown = numbers(page, "session.bundle.positions").reshape(frames, -1, 2)
     assert np.isfinite(shown).all()
     assert (shown >= bounds[:, 0] - 1e-6).all()
     assert (shown <= bounds[:, 1] + 1e-6).all()
     page.click("#restart")
-    wait_long(page, f"player.bundle.count === {count}")
+    wait_long(page, f"session.bundle.count === {count}")
 
 
 def test_another_file_than_the_pinned_one_is_not_run(hook, address, browser):

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from nmpm import Zoo
 from nmpm.play.limits import Limits
-from nmpm.play.pictures import page_scene
+from nmpm.play.pictures import describe_played
 from nmpm.viz.page import make_page, read_asset
 from nmpm.zoo import Pretrained
 from nmpm.zoo.export import FORMATS, Step, description
@@ -55,11 +55,15 @@ def described(model: Pretrained, runtime: str) -> dict[str, Any]:
     """What the page's scripts read of the scene, its start and the runtime."""
     state, limits = model.example(SEED), Limits(model)
     fastest = float(limits.fastest.amin())
-    return page_scene(
+    return describe_played(
         model.scene,
         f"{MODEL} in your browser",
         state.obstacle[0].numpy(),
+        model=MODEL,
+        tools=("throw",),
+        playing=True,
         pace=PACE,
+        beside=False,
         most=MOST,
         limits=[fastest],
         fastest=0.3 * fastest * model.scene.dt,

@@ -2,7 +2,8 @@
 
 A binary message starts with four little-endian 32-bit whole numbers: its kind, the picture's number, the frame that it
 shows, and its number of particles N. Then, for `EMULATOR` and `SIMULATOR`, N × D positions as unsigned 16-bit steps
-between `low` and `high` of the scene, 65535 for a particle that is not there; for `COLOURS`, N × 3 bytes of RGB.
+between `low` and `high` of the scene, 65535 for a particle that is not there; for `MATERIALS`, N bytes, indices of the
+scene's materials.
 """
 
 from __future__ import annotations
@@ -16,12 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm.colours import hex_code, material_colours
 from nmpm.obstacles import Body
 from nmpm.scene import Scene
-from nmpm.viz.page import ABSENT, STEPS, colour_scale, quantize
+from nmpm.viz.page import describe_scene, quantize
 
-EMULATOR, SIMULATOR, COLOURS = 0, 1, 2
+EMULATOR, SIMULATOR, MATERIALS = 0, 1, 2
 
 
 def picture(scene: Scene, kind: int, number: int, frame: int, position: NDArray[Any]) -> bytes:
@@ -31,11 +31,9 @@ def picture(scene: Scene, kind: int, number: int, frame: int, position: NDArray[
     return struct.pack("<4I", kind, number, frame, len(position)) + steps.tobytes()
 
 
-def colours(scene: Scene, material: NDArray[Any]) -> bytes:
-    """The colours of particles (N,)."""
-    palette = np.array(list(material_colours(scene.materials).values()), dtype=np.uint8)
-    rgb: NDArray[np.uint8] = palette[material]
-    return struct.pack("<4I", COLOURS, 0, 0, len(material)) + rgb.tobytes()
+def materials(material: NDArray[Any]) -> bytes:
+    """The materials of particles (N,)."""
+    return struct.pack("<4I", MATERIALS, 0, 0, len(material)) + material.astype(np.uint8).tobytes()
 
 
 def describe_bodies(bodies: Mapping[int, Body]) -> str:
@@ -47,23 +45,20 @@ def describe_bodies(bodies: Mapping[int, Body]) -> str:
     return json.dumps({"bodies": described})
 
 
-def page_scene(scene: Scene, title: str, static: NDArray[Any], **facts: Any) -> dict[str, Any]:
-    """What the page's scripts read of a scene, as those of the viewer's page do."""
+def describe_played(scene: Scene, title: str, static: NDArray[Any], **facts: Any) -> dict[str, Any]:
+    """What the page's scripts read of a scene with static obstacles (M, D), and further facts."""
     low, high = np.array(scene.domain).T
-    return {
-        "title": title,
-        "dim": scene.dim,
-        "dt": scene.dt,
-        "frames": 1,
-        "bounds": [list(side) for side in scene.bounds],
-        "domain": [list(side) for side in scene.domain],
-        "low": low.tolist(),
-        "high": (low + (high - low) * ABSENT / STEPS).tolist(),
-        "period": [hi - lo if wraps else 0.0 for (lo, hi), wraps in zip(scene.domain, scene.periodic, strict=True)],
-        "up": 1,
-        "spacing": scene.particle_spacing,
-        "materials": [{"name": n, "colour": hex_code(c)} for n, c in material_colours(scene.materials).items()],
-        "scale": colour_scale(),
-        "obstacles": quantize(static, low, high).reshape(-1).tolist(),
+    return describe_scene(
+        title=title,
+        bounds=scene.bounds,
+        domain=scene.domain,
+        period=[(high - low) * wraps for (low, high), wraps in zip(scene.domain, scene.periodic, strict=True)],
+        up=1,
+        dt=scene.dt,
+        spacing=scene.particle_spacing,
+        materials=scene.materials,
+        obstacles=static,
+        low=low,
+        high=high,
         **facts,
-    }
+    )

@@ -107,7 +107,7 @@ class PlayServer:
             known = (origins or [""])[0] in (f"http://{here}", f"http://localhost:{self.port}")
             return None if known else connection.respond(HTTPStatus.FORBIDDEN, "Another page may not play here.\n")
         if secrets.compare_digest(path, f"/{self.token}/".encode()):
-            return _html(make_page("play", {}))
+            return _html(make_page("socket", {"title": "nmpm play"}))
         return connection.respond(HTTPStatus.NOT_FOUND, "There is no such page: the address needs its token.\n")
 
 

@@ -94,12 +94,13 @@ class Session:
             "gravityTurns": self.scene.gravity_varies,
             "simulator": None if self._preset is None else self._preset.generator,
             "bundle": self.model.emulator.frames,
+            "tools": ("throw", "pour", "look")[: self.scene.dim],
             "playing": self.playing,
             "pace": self.pace,
             "beside": self._beside is not None,
         }
         static = self.world.static.numpy()
-        described = pictures.page_scene(self.scene, self.model.name, static, **facts)
+        described = pictures.describe_played(self.scene, f"nmpm play · {self.model.name}", static, **facts)
         self._show_all()
         return [json.dumps({"scene": described}), *self._sent()]
 
@@ -266,7 +267,7 @@ class Session:
         return len(free)
 
     def _particles_changed(self) -> None:
-        self._outbox.append(pictures.colours(self.scene, self.world.material.numpy()))
+        self._outbox.append(pictures.materials(self.world.material.numpy()))
         self._scene_changed()
 
     def _bodies_changed(self) -> None:

@@ -1,7 +1,9 @@
 """Pages for browsers: one HTML file without links, for any browser with WebGL 2.
 
-The scripts are the ES modules of the folder `app`, one of which starts each mode: `view` plays what the page contains,
-`play` what a server sends, `onnx` what a model in the browser predicts. Positions are unsigned 16-bit numbers.
+There is one template, `app/page.html`, and one script for each of its modes, the ES module of that name in `app` with
+all that it imports: `view` plays what the page contains, `socket` what a server sends, `onnx` what a model in the
+browser predicts. All read one description of the scene, of `describe_scene`, and positions that are unsigned 16-bit
+numbers.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import base64
 import json
 import re
 import zlib
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from typing import Any
 
@@ -17,7 +20,8 @@ import matplotlib
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm.colours import hex_code
+from nmpm.colours import hex_code, material_colours
+from nmpm.scene import Interval
 from nmpm.viz.trajectories import Floats
 
 COLOUR_SCALE = "YlGnBu_r"
@@ -28,17 +32,18 @@ ABSENT = 65535
 
 IMPORT = re.compile(r'^import {([^}]*)} from "\./(\w+)\.js";$', re.MULTILINE)
 EXPORT = re.compile(r"^export ((?:async )?(?:function|class|const) (\w+))", re.MULTILINE)
+ONLY = re.compile(r"<!--only ([a-z ]+)-->\n?(.*?)<!--end-->\n?", re.DOTALL)
 
 
-def make_page(mode: str, data: dict[str, Any]) -> str:
-    """The page of a mode, with data that its scripts read."""
+def make_page(mode: str, data: Mapping[str, Any]) -> str:
+    """The page of a mode, which reads this data."""
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     contents = {
-        "/*STYLE*/": read_asset("style.css") + read_asset("play.css"),
+        "/*STYLE*/": read_asset("style.css"),
         "/*SCRIPT*/": bundle(mode),
         "/*DATA*/": text.replace("<", "\\u003c"),  # `</script>` in a text would end the data
     }
-    page = read_asset(f"{mode}.html")
+    page = ONLY.sub(lambda part: part[2] if mode in part[1].split() else "", read_asset("page.html"))
     for mark, content in contents.items():
         before, after = page.split(mark)
         page = before + content + after
@@ -71,10 +76,56 @@ def read_asset(name: str) -> str:
     return files("nmpm.viz").joinpath("app", name).read_text(encoding="utf-8")
 
 
-def colour_scale() -> list[str]:
-    """The scale's colours, as #rrggbb."""
+def describe_scene(
+    *,
+    title: str,
+    bounds: Sequence[Interval],
+    domain: Sequence[Interval],
+    period: Sequence[float],
+    up: int,
+    dt: float,
+    spacing: float,
+    materials: Iterable[str],
+    obstacles: Floats,
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    **facts: Any,
+) -> dict[str, Any]:
+    """The scene as the scripts of all modes read it, in domain length, and further facts of one mode.
+
+    Args:
+        title: Of the page.
+        bounds: Region of the particles, (lower, upper) per axis.
+        domain: Outer side of the walls, (lower, upper) per axis.
+        period: Length along periodic axes, 0 along the others.
+        up: Axis that is drawn vertically.
+        dt: Seconds between two frames.
+        spacing: Between particles.
+        materials: Names, to which the particles' indices point.
+        obstacles: (M, D) positions of particles that do not move.
+        low: (D,) lowest position that is shown.
+        high: (D,) highest position that is shown.
+        facts: Of one mode.
+    """
     scale = np.round(255 * matplotlib.colormaps[COLOUR_SCALE](np.linspace(0, 1, 64))).astype(int).tolist()
-    return [hex_code((red, green, blue)) for red, green, blue, _ in scale]
+    return {
+        "title": title,
+        "dim": len(bounds),
+        "bounds": bounds,
+        "domain": domain,
+        "period": period,
+        "up": up,
+        "dt": dt,
+        "spacing": spacing,
+        "materials": [{"name": name, "colour": hex_code(rgb)} for name, rgb in material_colours(materials).items()],
+        "scale": [hex_code((red, green, blue)) for red, green, blue, _ in scale],
+        "low": low.tolist(),
+        "high": (low + (high - low) * ABSENT / STEPS).tolist(),
+        "obstacles": pack_positions(quantize(obstacles.astype(np.float64), low, high)[None]),
+        "frames": 1,
+        "fields": [],
+        **facts,
+    }
 
 
 def quantize(position: Floats, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.uint16]:

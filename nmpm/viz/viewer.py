@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nmpm.colours import hex_code, material_colours
+from nmpm.colours import hex_code
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import vertical_axis
 from nmpm.viz.occupancy import CELL, LEVELS, ensemble_colour
 from nmpm.viz.output import check_output, replace_picture
-from nmpm.viz.page import ABSENT, STEPS, colour_scale, make_page, pack_bytes, pack_positions, quantize
+from nmpm.viz.page import ABSENT, describe_scene, make_page, pack_bytes, pack_positions, quantize
 from nmpm.viz.panel import particle_spacing
 from nmpm.viz.quantities import quantity_curves
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
@@ -126,56 +126,41 @@ def _describe(trajectories: LabelledTrajectories, every: int) -> dict[str, Any]:
         for label, position in trajectories.positions.items()
     }
     first, *others = positions.values()
-    colours = material_colours(trajectories.materials)
-    index = {name: number for number, name in enumerate(colours)}
-    sampled = np.unique(np.linspace(0, len(first) - 1, SAMPLED_FRAMES).astype(int))
-    moved = [path[sampled[1:]] - path[sampled[1:] - 1] for path in positions.values()]
-    return {
-        "title": trajectories.title or "nmpm",
-        "every": every,
-        "dt": trajectories.dt * every,
-        "dim": trajectories.dim,
-        "bounds": [list(side) for side in trajectories.bounds],
-        "domain": [list(side) for side in trajectories.outer_bounds],
-        "period": list(trajectories.periods),
-        "up": vertical_axis(trajectories),
-        "tilt": trajectories.tilt,
-        "materials": [{"name": name, "colour": hex_code(colour)} for name, colour in colours.items()],
-        "particles": pack_bytes(np.array([index[name] for name in trajectories.material.tolist()], dtype=np.uint8)),
-        "scale": colour_scale(),
-        "fastest": _nearly_largest(trajectories, moved),
-        "worst": _nearly_largest(trajectories, [other[sampled] - first[sampled] for other in others]),
-        **_describe_motion(trajectories, positions, every),
-        "fields": [_describe_field(trajectories, name, every) for name in trajectories.fields],
-        "curves": _describe_curves(trajectories, every),
-    }
-
-
-def _describe_motion(trajectories: LabelledTrajectories, positions: dict[str, Floats], every: int) -> dict[str, Any]:
-    """Packed positions, and errors in domain lengths."""
-    obstacles = trajectories.obstacles.astype(np.float64)
-    longest = max(high - low for low, high in trajectories.outer_bounds)
-    spacing = particle_spacing(trajectories.fullest_frame)
-    frames, count, dim = next(iter(positions.values())).shape
+    frames, count, dim = first.shape
     room = 2 * frames * count * dim * len(trajectories.further_members)
     stride = min(max(1, -(-room // MEMBER_BYTES)), MOST_LEFT_OUT)
-    further = {label: each[::every, ::stride] for label, each in trajectories.further_members.items()}
-
-    def extreme(find: np.ufunc) -> NDArray[np.float64]:
-        arrays = np.array(trajectories.outer_bounds).T, obstacles, *positions.values()
-        wrapped = (trajectories.wrap(each.astype(np.float64)) for each in further.values())
-        ends = [find.reduce(each.reshape(-1, dim), axis=0) for each in (*arrays, *wrapped) if each.size]
-        return np.asarray(find.reduce(np.stack(ends), axis=0))
-
-    low, high = extreme(np.fmin), extreme(np.fmax)
+    further = {
+        label: trajectories.wrap(each[::every, ::stride].astype(np.float64))
+        for label, each in trajectories.further_members.items()
+    }
+    everything = (np.array(trajectories.outer_bounds).T, trajectories.obstacles, *positions.values(), *further.values())
+    points = [each.reshape(-1, dim) for each in everything if each.size]
+    low, high = (find.reduce([find.reduce(each, axis=0) for each in points], axis=0) for find in (np.fmin, np.fmax))
+    sampled = np.unique(np.linspace(0, frames - 1, SAMPLED_FRAMES).astype(int))
+    moved = [path[sampled[1:]] - path[sampled[1:] - 1] for path in positions.values()]
     errors = {label: curve[::every] for label, curve in trajectories.rms_errors().items()}
-    return {
-        "frames": frames,
-        "spacing": min(spacing, longest / 20),
-        "low": low.tolist(),
-        "high": (low + (high - low) * ABSENT / STEPS).tolist(),
-        "obstacles": pack_positions(quantize(obstacles, low, high)[None]),
-        "trajectories": [
+    index = {name: number for number, name in enumerate(trajectories.materials)}
+    spacing = particle_spacing(trajectories.fullest_frame)
+    longest = max(high - low for low, high in trajectories.outer_bounds)
+    return describe_scene(
+        title=trajectories.title or "nmpm",
+        bounds=trajectories.bounds,
+        domain=trajectories.outer_bounds,
+        period=trajectories.periods,
+        up=vertical_axis(trajectories),
+        dt=trajectories.dt * every,
+        spacing=min(spacing, longest / 20),
+        materials=trajectories.materials,
+        obstacles=trajectories.obstacles,
+        low=low,
+        high=high,
+        frames=frames,
+        every=every,
+        tilt=trajectories.tilt,
+        particles=pack_bytes(np.array([index[name] for name in trajectories.material.tolist()], dtype=np.uint8)),
+        fastest=_nearly_largest(trajectories, moved),
+        worst=_nearly_largest(trajectories, [other[sampled] - first[sampled] for other in others]),
+        trajectories=[
             {
                 "label": label,
                 "positions": pack_positions(quantize(position, low, high)),
@@ -183,23 +168,25 @@ def _describe_motion(trajectories: LabelledTrajectories, positions: dict[str, Fl
             }
             for label, position in positions.items()
         ],
-        "members": [
-            {"label": label, "positions": _pack_member(trajectories.wrap(each.astype(np.float64)), low, high)}
-            for label, each in further.items()
+        members=[
+            {"label": label, "positions": pack_positions(_coarse(quantize(position, low, high)))}
+            for label, position in further.items()
         ],
-        "bands": {
+        bands={
             "stride": stride,
             "cell": (CELL if stride == 1 else SPARSE_CELL) * min(spacing * stride ** (1 / dim), longest / 20),
             "levels": LEVELS,
             "tints": BAND_TINTS,
             "colour": hex_code(ensemble_colour(trajectories.materials)),
         },
-    }
+        fields=[_describe_field(trajectories, name, every) for name in trajectories.fields],
+        curves=_describe_curves(trajectories, every),
+    )
 
 
-def _pack_member(position: Floats, low: NDArray[np.float64], high: NDArray[np.float64]) -> str:
-    steps = quantize(position, low, high)
-    return pack_positions(np.where(steps == ABSENT, ABSENT, steps // MEMBER_STEPS * MEMBER_STEPS).astype(np.uint16))
+def _coarse(steps: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Positions rounded down to multiples of `MEMBER_STEPS`."""
+    return np.where(steps == ABSENT, ABSENT, steps // MEMBER_STEPS * MEMBER_STEPS).astype(np.uint16)
 
 
 def _describe_curves(trajectories: LabelledTrajectories, every: int) -> list[dict[str, Any]]:

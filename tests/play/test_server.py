@@ -109,12 +109,12 @@ def test_another_page_takes_over(server):
 
 @pytest.fixture
 def page(visit, server):
-    return visit(server.address, "window.play && play.stage && play.stage.drawn > 2", 500, 500)
+    return visit(server.address, "window.play && play.drawn > 2", 500, 500)
 
 
 def at(page, point):
     """Pixels of the window at a point of the scene."""
-    x, y = page.evaluate(f"play.stage.pixelOf({json.dumps(point)})")
+    x, y, *_ = page.evaluate(f"play.pixelOf({json.dumps(point)})")
     box = page.locator("#scene").bounding_box()
     return box["x"] + x, box["y"] + y
 
@@ -129,14 +129,14 @@ def drag(page, start, end):
 def test_start_throw_drag_pour_close(page, server):
     page.click("#restart")
     page.evaluate("play.send({do: 'play', on: false})")
-    wait_until(page, "play.stage.films[0].frame < 5")
-    count = page.evaluate("play.stage.films[0].count")
+    wait_until(page, "play.films[0].frame < 5")
+    count = page.evaluate("play.films[0].position.length")
     drag(page, [0.15, 0.85], [0.2, 0.85])
-    wait_until(page, f"play.stage.films[0].count > {count}")
-    body = page.evaluate("play.stage.bodies[0]")
+    wait_until(page, f"play.films[0].position.length > {count}")
+    body = page.evaluate("play.bodies[0]")
     goal = [0.5, 0.6]
     drag(page, body["centre"], goal)
-    wait_until(page, f"Math.abs(play.stage.bodies[0].centre[1] - {goal[1]}) < 0.02")
+    wait_until(page, f"Math.abs(play.bodies[0].centre[1] - {goal[1]}) < 0.02")
     page.select_option("#colour", "speed")
     legend = (
         "Array.from(document.querySelector('#legend canvas').getContext('2d').getImageData(0, 0, 1, 1).data).join()"
@@ -147,23 +147,23 @@ def test_start_throw_drag_pour_close(page, server):
     page.keyboard.press("t")
     page.keyboard.press("p")
     page.keyboard.press(" ")
-    count = page.evaluate("play.stage.films[0].count")
+    count = page.evaluate("play.films[0].position.length")
     page.mouse.move(*at(page, [0.85, 0.85]))
     page.mouse.down()
-    wait_until(page, f"play.stage.films[0].count > {count}")
+    wait_until(page, f"play.films[0].position.length > {count}")
     page.mouse.up()
-    wait_until(page, "document.getElementById('rate').textContent.includes('pictures/s')")
+    wait_until(page, "document.getElementById('pictures').textContent.includes('pictures/s')")
     page.close()
     assert get(server, f"/{server.token}/")[0] == 200  # another page may be opened
 
 
 def test_a_body_comes_to_rest_under_the_pointer_that_holds_it(page, server):
-    body = page.evaluate("play.stage.bodies[0]")
+    body = page.evaluate("play.bodies[0]")
     page.mouse.move(*at(page, body["centre"]))
     page.mouse.down()
     for goal in ([0.45, 0.6], [0.5, 0.7]):  # faster than moves are sent
         page.mouse.move(*at(page, goal))
-    wait_until(page, "play.stage.bodies[0].centre[1] > 0.68")
+    wait_until(page, "play.bodies[0].centre[1] > 0.68")
     wait_for(lambda: abs(server.session.world.bodies[body["id"]].centre[1] - 0.7) < 0.01)
     page.mouse.up()
 

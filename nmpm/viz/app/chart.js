@@ -1,9 +1,7 @@
 // The chart under the time slider.
 
-import { css, scene } from "./scene.js";
+import { css, digits, scene } from "./scene.js";
 
-export const digits = (value, count = 2) =>
-  value === 0 || Math.abs(value) >= 1e-3 ? String(Number(value.toPrecision(count))) : value.toExponential(1);
 const BESIDE = { left: 52, right: 10, top: 18, bottom: 17 }; // the axes, in pixels
 
 /** Some round numbers between two ends. */

@@ -1,7 +1,7 @@
 // Where an ensemble's members are, in 2-D: the share of them that occupy each cell, as bands; see occupancy.py.
 
-import { compile, rectangle } from "./drawing.js";
-import { readColour, scene } from "./scene.js";
+import { bindTexture, compile, rectangle } from "./drawing.js";
+import { ABSENT, readColour, scene } from "./scene.js";
 
 const COVER = `#version 300 es
 in vec3 position; uniform mat4 view; uniform vec2 low, extent; out vec2 at;
@@ -25,17 +25,14 @@ void main() {
 
 export class Density {
   /** @param members 16-bit positions: of the first all, of the others each n-th; in all of them each n-th counts. */
-  constructor(gl, members) {
-    Object.assign(this, { gl, members });
+  constructor(drawing, members) {
+    const { gl } = drawing;
+    Object.assign(this, { drawing, members });
     this.bands = compile(gl, COVER, BANDS, ["position"]);
     this.low = scene.bounds.map(([low]) => low);
     this.cells = scene.bounds.map(([low, high]) => Math.ceil((high - low) / scene.bands.cell));
-    this.texture = gl.createTexture();
-    this.corners = gl.createBuffer();
     gl.activeTexture(gl.TEXTURE1);
-    gl.bindTexture(gl.TEXTURE_2D, this.texture);
-    for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
-    for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
+    bindTexture(gl);
     gl.activeTexture(gl.TEXTURE0);
   }
 
@@ -55,7 +52,7 @@ export class Density {
     const scale = [0, 1].map((axis) => (scene.high[axis] - scene.low[axis]) / 65535 / scene.bands.cell);
     const shift = [0, 1].map((axis) => (scene.low[axis] - this.low[axis]) / scene.bands.cell);
     for (let i = frame * size; i < (frame + 1) * size; i += 2 * stride) {
-      if (positions[i] === 65535) continue; // ABSENT of page.py
+      if (positions[i] === ABSENT) continue;
       const x = Math.floor(positions[i] * scale[0] + shift[0]), y = Math.floor(positions[i + 1] * scale[1] + shift[1]);
       if (x < 0 || y < 0 || x >= columns || y >= rows) continue;
       for (let row = Math.max(0, y - 1); row <= Math.min(rows - 1, y + 1); row++)
@@ -67,7 +64,7 @@ export class Density {
 
   /** Draws the bands over the box, in the panel that `Drawing.startPanel` has begun. */
   draw(frame, view) {
-    const gl = this.gl, at = this.bands.at, [columns, rows] = this.cells;
+    const gl = this.drawing.gl, at = this.bands.at, [columns, rows] = this.cells, { cell, levels, tints, colour } = scene.bands;
     gl.useProgram(this.bands.program);
     gl.activeTexture(gl.TEXTURE1);
     if (this.frame !== frame) {
@@ -75,18 +72,14 @@ export class Density {
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.R8, columns, rows, 0, gl.RED, gl.UNSIGNED_BYTE, bytes);
       this.frame = frame;
     }
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.corners);
-    gl.bufferData(gl.ARRAY_BUFFER, Float32Array.from(rectangle(scene.bounds).flat()), gl.STREAM_DRAW);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
-    for (let i = 1; i < 5; i++) gl.disableVertexAttribArray(i);
+    this.drawing.sendCorners(rectangle(scene.bounds));
     gl.uniformMatrix4fv(at("view"), false, view);
     gl.uniform2f(at("low"), ...this.low);
-    gl.uniform2f(at("extent"), columns * scene.bands.cell, rows * scene.bands.cell);
+    gl.uniform2f(at("extent"), columns * cell, rows * cell);
     gl.uniform2f(at("cells"), columns, rows);
-    gl.uniform3f(at("levels"), ...scene.bands.levels);
-    gl.uniform3f(at("tints"), ...scene.bands.tints);
-    gl.uniform3f(at("colour"), ...readColour(scene.bands.colour));
+    gl.uniform3f(at("levels"), ...levels);
+    gl.uniform3f(at("tints"), ...tints);
+    gl.uniform3f(at("colour"), ...readColour(colour));
     gl.uniform1i(at("share"), 1);
     gl.drawArrays(gl.TRIANGLE_STRIP, 0, 4);
     gl.activeTexture(gl.TEXTURE0);

@@ -1,89 +1,86 @@
-// Playing: the connection to the server, the controls, and the figures.
+// A page that is played with: its controls send commands, and a session answers with pictures; see pictures.py.
 
-import { Pointer } from "./aiming.js";
+import { Pointer, bodyCorners } from "./aiming.js";
 import { MODES } from "./drawing.js";
-import { colourLegend } from "./legend.js";
-import { element, scene } from "./scene.js";
-import { COLOURS, EMULATOR, SIMULATOR, Stage } from "./stage.js";
+import { Page } from "./page.js";
+import { coloursOf, element, make, scene } from "./scene.js";
 
-const ICONS = { pause: "M3 2 H6.5 V14 H3 Z M9.5 2 H13 V14 H9.5 Z", play: "M3.5 1.5 L14 8 L3.5 14.5 Z" };
+/** Kinds of what a session sends: frames of its two predictors, and the materials of the particles. */
+export const EMULATOR = 0;
+export const SIMULATOR = 1;
 const PACES = [1, 2, 4];
+export const RATE = 60; // pictures a second
 const TURN = Math.PI / 12;
-const SAID = 6000; // milliseconds that a line stays
 
-class Play {
-  constructor() {
-    Object.assign(this, { tool: "throw", material: 0, pictures: [], picture: 0, acknowledged: 0, playing: true });
-    const socket = new WebSocket(`${location.origin.replace("http", "ws")}${location.pathname}socket`);
-    socket.binaryType = "arraybuffer";
-    socket.onmessage = ({ data }) => (typeof data === "string" ? this.read(JSON.parse(data)) : this.take(data));
-    socket.onclose = ({ reason }) => this.end(reason);
-    this.socket = socket;
-    this.send = (command) => socket.readyState === WebSocket.OPEN && socket.send(JSON.stringify(command));
+export class Play extends Page {
+  /** @param send Sends a command to the session; @param obstacles 16-bit positions. */
+  constructor(send, obstacles) {
+    super(obstacles);
+    const films = [EMULATOR, SIMULATOR].map(() => ({ position: [], frame: 0, step: 1 }));
+    Object.assign(this, { send, films, bodies: [], touched: null, beside: false, times: [], picture: 0, acknowledged: 0 });
+    const tools = [["throw", "Throw", "v"], ["pour", "Pour", "p"], ["look", "Look", ""]].filter(([name]) => scene.tools.includes(name));
+    this.fillChoices("tools", tools.map(([name, label, key]) => ({ value: name, key, content: [label] })), (name) => (this.tool = name));
+    const dot = (colour) => make("i", { style: `background: ${colour}` });
+    const materials = scene.materials.map(({ name, colour }, index) => ({ value: index, key: index + 1, content: [dot(colour), name] }));
+    this.fillChoices("materials", materials, (index) => (this.material = index));
+    element("pace").replaceChildren(...PACES.map((pace) => new Option(`${Number((RATE * pace * scene.dt).toPrecision(2))} × real time`, pace)));
+    element("pace").value = scene.pace;
+    element("tools").hidden = element("materials").hidden = scene.tools.length < 2;
+    element("seed-choice").hidden = element("save").hidden = scene.seed === undefined;
+    element("body-tools").hidden = !scene.obstaclesMove;
+    element("gravity").hidden = !scene.gravityTurns;
+    element("beside").hidden = !scene.simulator;
+    this.pointer = new Pointer(this);
+    this.showPlaying(scene.playing);
+    this.showBeside(scene.beside);
+    this.showLegend();
   }
 
   // What comes in.
 
-  read(message) {
-    if (message.scene) this.begin(message.scene);
-    if (message.bodies) this.setBodies(message.bodies);
-    if (message.gravity) this.setGravity(message.gravity, message.seed);
-    if (message.say) this.say(message.say, message.kind);
-    if (message.status) this.showStatus(message.status);
+  read({ bodies, gravity, seed, say, kind, status }) {
+    if (bodies) this.setBodies(bodies);
+    if (gravity) this.setGravity(gravity);
+    if (seed !== undefined && document.activeElement !== element("seed")) element("seed").value = seed;
+    if (say) this.say(say, kind);
+    if (status) this.showStatus(status);
   }
 
-  take(data) {
-    const [kind, number, frame] = new Uint32Array(data, 0, 4);
-    if (kind === COLOURS) return this.stage.setColours(new Uint8Array(data, 16));
-    this.stage.films[kind].take(frame, new Uint16Array(data, 16));
-    if (kind === EMULATOR) this.picture = number;
-    this.stage.show();
-  }
+  /** Takes the materials of the particles, indices. */
+  takeMaterials(materials) { this.drawing.setColours(coloursOf(materials)); }
 
-  begin(described) {
-    Object.assign(scene, described);
-    this.stage = new Stage();
-    this.stage.onDrawn = (now) => this.drawnAt(now);
-    this.pointer = new Pointer(this.stage, this.send, this);
-    this.fill();
-    this.listen();
-    this.stage.setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
-    this.showLegend();
-    element("message").hidden = true;
-  }
-
-  end(reason) {
-    element("message").textContent = `${reason || "nmpm play has ended"}. Reload the page to play on.`;
-    element("message").hidden = false;
+  /** Takes a picture: 16-bit positions at a frame. */
+  takeFrame(kind, picture, frame, position) {
+    const before = this.films[kind], same = before.position.length === position.length;
+    this.films[kind] = { frame, position, previous: same && before.position, step: Math.max(1, frame - before.frame) };
+    if (kind === EMULATOR) this.picture = picture;
+    this.show();
   }
 
   /** Acknowledges what is drawn, and counts it. */
-  drawnAt(now) {
+  onDrawn(now) {
     if (this.picture === this.acknowledged) return;
     this.acknowledged = this.picture;
     this.send({ do: "seen", picture: this.picture });
-    this.pictures.push(now);
-    while (this.pictures[0] < now - 1000) this.pictures.shift();
-    this.placeLabels();
+    this.times = [...this.times.filter((time) => time >= now - 1000), now];
   }
 
-  /** The server's bodies, but for one that is being dragged here. */
+  /** Takes the session's bodies, but for one that is being dragged here. */
   setBodies(bodies) {
     const held = this.pointer.action?.body;
-    this.stage.bodies = bodies.map((body) => (body.id === held?.id ? held : body));
-    if (!bodies.some(({ id }) => id === this.stage.touched)) this.touch(null);
-    this.stage.show();
+    this.bodies = bodies.map((body) => (body.id === held?.id ? held : body));
+    if (!bodies.some(({ id }) => id === this.touched)) this.touch(null);
+    this.show();
   }
 
-  setGravity(gravity, seed) {
+  setGravity(gravity) {
     scene.gravity = gravity;
-    if (seed !== undefined && document.activeElement !== element("seed")) element("seed").value = seed;
     element("arrow").style.transform = `rotate(${-Math.atan2(gravity[0], -gravity[1])}rad)`;
   }
 
   showStatus({ particles, call, simulator, playing, beside }) {
     const ms = (value) => `${value < 10 ? value.toFixed(1) : Math.round(value)} ms`;
-    element("rate").textContent = `${this.pictures.length} pictures/s`;
+    element("pictures").textContent = `${this.times.length} pictures/s`;
     element("call").textContent = `${ms(call)} a call of ${scene.bundle} frames (${ms(call / scene.bundle)} a frame)`
       + (simulator ? `, simulator ${ms(simulator)} a frame` : "");
     element("count").textContent = `${particles.toLocaleString("en")} of at most ${scene.most.toLocaleString("en")} particles`;
@@ -91,124 +88,66 @@ class Play {
     this.showBeside(beside);
   }
 
-  showPlaying(on) {
-    this.playing = on;
-    element("play").innerHTML = `<svg viewBox="0 0 16 16"><path d="${on ? ICONS.pause : ICONS.play}"/></svg>`;
-    element("play").setAttribute("aria-label", on ? "Pause" : "Play");
-  }
-
   showBeside(on) {
     element("beside").setAttribute("aria-pressed", on);
-    if (on === this.stage.beside) return;
-    this.stage.beside = on;
-    Object.assign(this.stage.films[SIMULATOR], { count: 0, frame: 0 });
-    this.stage.show();
+    if (on !== this.beside) this.films[SIMULATOR] = { position: [], frame: 0, step: 1 };
+    this.beside = on;
+    this.show();
   }
 
-  say(text, kind) {
-    const line = element("say");
-    line.textContent = text;
-    line.className = kind;
-    line.hidden = false;
-    clearTimeout(this.saying);
-    this.saying = setTimeout(() => (line.hidden = true), SAID);
+  // What is drawn.
+
+  get shown() { return this.beside ? [EMULATOR, SIMULATOR] : [EMULATOR]; }
+
+  labelOf(kind) {
+    const { frame } = this.films[kind], behind = this.films[EMULATOR].frame - frame;
+    if (kind === EMULATOR) return [scene.model, make("small", {}, `frame ${frame}, ${(frame * scene.dt).toFixed(2)} s`)];
+    return [scene.simulator, make("small", {}, frame ? `frame ${frame}${behind > 0 ? `, ${behind} behind` : ""}` : "is starting …")];
   }
 
-  placeLabels() {
-    const [now, simulated] = this.stage.films.map(({ frame }) => frame), behind = now - simulated;
-    const texts = [
-      [scene.model, `frame ${now}, ${(now * scene.dt).toFixed(2)} s`],
-      [scene.simulator, simulated ? `frame ${simulated}${behind > 0 ? `, ${behind} behind` : ""}` : "is starting …"],
-    ];
-    element("labels").replaceChildren(...this.stage.panels().map(({ x, y, width }, index) => {
-      const label = document.createElement("span"), time = document.createElement("small");
-      [label.textContent, time.textContent] = texts[index];
-      Object.assign(label.style, { left: `${x + width / 2}px`, top: `${y - 24}px` });
-      label.append(time);
-      return label;
-    }));
+  drawBehind() {
+    for (const body of this.bodies)
+      this.drawing.drawCorners(bodyCorners(body), this.drawing.gl.TRIANGLE_FAN, body.id === this.touched ? this.theme.faint : this.theme.ghost);
   }
+
+  drawContents(kind, matrix, look) {
+    const film = this.films[kind], mode = film.previous ? look.mode : MODES.material;
+    this.drawing.drawFrame(film, matrix, { ...look, mode, top: scene.fastest * film.step });
+  }
+
+  /** The point of the scene under a pixel of the first panel; in 3-D that in the plane through the box's middle. */
+  pointAt(x, y) {
+    const { x: left, y: top, width, height } = this.panels()[0];
+    return this.camera.pointAt((2 * (x - left)) / width - 1, 1 - (2 * (y - top)) / height, width, height);
+  }
+
+  /** The pixel of a point in the first panel, and further numbers, see `projection`. */
+  pixelOf(point) { return this.projection(this.panels()[0])(point); }
 
   // The controls.
 
-  fill() {
-    element("title").textContent = document.title = `nmpm play · ${scene.title}`;
-    const tools = [["throw", "Throw"], ["pour", "Pour"], ...(scene.dim === 3 ? [["look", "Look"]] : [])];
-    this.choices("tools", tools, (name) => (this.tool = name));
-    this.choices("materials", scene.materials.map(({ name, colour }, index) => [index, name, colour]), (index) => (this.material = index));
-    element("pace").replaceChildren(...PACES.map((pace) => new Option(`${Number((60 * pace * scene.dt).toPrecision(2))} × real time`, pace)));
-    element("pace").value = scene.pace;
-    element("body-tools").hidden = !scene.obstaclesMove;
-    element("gravity").hidden = !scene.gravityTurns;
-    element("beside").hidden = !scene.simulator;
-    element("seed").value = scene.seed;
-    this.showPlaying(scene.playing);
-    this.showBeside(scene.beside);
-  }
-
   /** Buttons of which one is chosen. */
-  choices(id, options, choose) {
-    const buttons = options.map(([value, label, colour]) => {
-      const button = document.createElement("button"), dot = document.createElement("i");
-      dot.style.background = colour ?? "";
-      button.append(...(colour ? [dot] : []), label);
-      button.setAttribute("role", "radio");
-      button.addEventListener("click", () => {
+  fillChoices(id, options, choose) {
+    const buttons = options.map(({ value, key, content }) => {
+      const button = make("button", { role: "radio", onclick: () => {
         choose(value);
         buttons.forEach((other) => other.setAttribute("aria-checked", other === button));
-      });
+      } }, ...content);
+      button.dataset.keys = key;
       return button;
     });
     element(id).replaceChildren(...buttons);
     buttons[0].click();
   }
 
-  listen() {
-    const on = (id, name, action) => element(id).addEventListener(name, action);
-    on("play", "click", () => this.toggle());
-    on("step", "click", () => this.step());
-    on("restart", "click", () => this.restart());
-    on("seed", "change", () => this.restart());
-    on("pace", "change", () => this.setPace(Number(element("pace").value)));
-    on("beside", "click", () => this.toggleBeside());
-    on("save", "click", () => this.send({ do: "save" }));
-    on("colour", "change", () => this.showLegend());
-    on("ramp", "click", () => this.put("ramp"));
-    on("disc", "click", () => this.put("disc"));
-    on("remove", "click", () => this.remove());
-    on("theme", "click", () => this.turnTheme());
-    on("help", "click", () => element("keys").showModal());
-    on("gravity", "pointerdown", (event) => element("gravity").setPointerCapture(event.pointerId));
-    on("gravity", "pointermove", (event) => event.buttons && this.pullTowards(event));
-    on("gravity", "keydown", (event) => this.turnByArrow(event));
-    document.addEventListener("keydown", (event) => this.press(event));
+  toggle() {
+    this.showPlaying(!this.playing);
+    this.send({ do: "play", on: this.playing });
   }
 
-  press(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || element("keys").open) return;
-    if (["INPUT", "SELECT"].includes(event.target.tagName) || (event.target.tagName === "BUTTON" && [" ", "Enter"].includes(event.key))) return;
-    const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-    const actions = {
-      " ": () => this.toggle(), ArrowRight: () => this.step(), r: () => this.restart(), n: () => this.nextSeed(), b: () => this.toggleBeside(),
-      s: () => this.send({ do: "save" }), t: () => this.turnTheme(), v: () => this.choose("tools", 0), p: () => this.choose("tools", 1),
-      g: () => this.turnGravity(event.shiftKey ? -TURN : TURN), Delete: () => this.remove(), Backspace: () => this.remove(),
-      c: () => this.nextColour(), "[": () => this.changePace(-1), "]": () => this.changePace(1), "?": () => element("keys").showModal(),
-    };
-    const action = actions[key] ?? (/^[1-9]$/.test(key) ? () => this.choose("materials", Number(key) - 1) : null);
-    if (!action) return;
-    event.preventDefault();
-    action();
-  }
-
-  choose(id, index) { element(id).children[index]?.click(); }
-  toggle() { this.showPlaying(!this.playing); this.send({ do: "play", on: this.playing }); }
-  step() { this.showPlaying(false); this.send({ do: "step" }); }
-  toggleBeside() { this.send({ do: "beside", on: !this.stage.beside }); }
-  put(kind) { this.send({ do: "put", kind, centre: scene.bounds.map(([low, high]) => (low + high) / 2) }); }
-  remove() { if (this.stage.touched != null) this.send({ do: "remove", body: this.stage.touched }); }
-  turnTheme() {
-    this.stage.setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
-    this.showLegend(); // its scale is the theme's
+  step() {
+    this.showPlaying(false);
+    this.send({ do: "step" });
   }
 
   restart() {
@@ -221,35 +160,34 @@ class Play {
     this.restart();
   }
 
-  setPace(pace) {
-    scene.pace = pace;
-    element("pace").value = pace;
-    this.send({ do: "pace", frames: pace });
+  setPace() { this.send({ do: "pace", frames: Number(element("pace").value) }); }
+  slower() { this.changePace(-1); }
+  faster() { this.changePace(1); }
+
+  changePace(by) {
+    element("pace").selectedIndex = Math.min(Math.max(element("pace").selectedIndex + by, 0), PACES.length - 1);
+    this.setPace();
   }
 
-  changePace(by) { this.setPace(PACES[Math.min(Math.max(PACES.indexOf(scene.pace) + by, 0), PACES.length - 1)]); }
+  save() { this.send({ do: "save" }); }
+  toggleBeside() { this.send({ do: "beside", on: !this.beside }); }
+  putBody({ currentTarget }) { this.send({ do: "put", kind: currentTarget.id, centre: scene.bounds.map(([low, high]) => (low + high) / 2) }); }
+  removeBody() { if (this.touched !== null) this.send({ do: "remove", body: this.touched }); }
 
   touch(id) {
-    this.stage.touched = id;
-    element("remove").disabled = id == null;
+    this.touched = id;
+    element("remove").disabled = id === null;
   }
 
-  nextColour() {
-    element("colour").selectedIndex = 1 - element("colour").selectedIndex;
-    this.showLegend();
-  }
+  legend() { return this.colour === "speed" ? super.legend() : []; }
 
-  showLegend() {
-    const colour = element("colour").value;
-    element("legend").replaceChildren(...(colour === "speed" ? colourLegend({ colour, mode: MODES.speed }) : []));
-    this.stage.show();
-  }
-
-  /** Gravity towards the pointer, from the middle of its button. */
+  /** Turns gravity towards the pointer, from the middle of its button. */
   pullTowards(event) {
-    const { left, top, width, height } = element("gravity").getBoundingClientRect();
-    const [x, y] = [event.clientX - left - width / 2, top + height / 2 - event.clientY], length = Math.hypot(x, y);
-    if (length > 4) this.sendGravity([x / length, y / length]);
+    if (!event.buttons) return;
+    const button = element("gravity"), { left, top, width, height } = button.getBoundingClientRect();
+    button.setPointerCapture(event.pointerId);
+    const [x, y] = [event.clientX - left - width / 2, top + height / 2 - event.clientY];
+    if (Math.hypot(x, y) > 4) this.pointGravity(Math.atan2(y, x));
   }
 
   turnByArrow(event) {
@@ -260,17 +198,12 @@ class Play {
     this.turnGravity(turn);
   }
 
-  turnGravity(angle) {
-    if (!scene.gravityTurns) return;
-    const [x, y] = scene.gravity, [c, s] = [Math.cos(angle), Math.sin(angle)], pull = Math.hypot(...scene.gravity);
-    this.sendGravity([(c * x - s * y) / pull, (s * x + c * y) / pull]);
-  }
+  turnByKey({ shiftKey }) { if (scene.gravityTurns) this.turnGravity(shiftKey ? -TURN : TURN); }
+  turnGravity(turn) { this.pointGravity(Math.atan2(scene.gravity[1], scene.gravity[0]) + turn); }
 
-  sendGravity(direction) {
-    const pull = Math.hypot(...scene.gravity), vector = [direction[0] * pull, direction[1] * pull, ...scene.gravity.slice(2)];
+  pointGravity(angle) {
+    const pull = Math.hypot(...scene.gravity), vector = [pull * Math.cos(angle), pull * Math.sin(angle), ...scene.gravity.slice(2)];
     this.setGravity(vector);
     this.pointer.sometimes(() => this.send({ do: "gravity", vector }));
   }
 }
-
-window.play = new Play();

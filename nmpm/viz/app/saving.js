@@ -1,16 +1,15 @@
 // Saving what is shown: a picture (PNG), or all frames as a film (WebM) or an animation (GIF).
 
 import { Gif } from "./gif.js";
-import { css, element, scene } from "./scene.js";
+import { css, element, make, scene } from "./scene.js";
 
 const HEAD = 30; // pixels above the panels, for the title
 const GIF_WIDTH = 720, GIF_PICTURES = 250, GIF_RATE = 25; // at most so many pixels, pictures, and pictures per second
 
 /** Hands a file over to the browser's downloads. */
 function download(blob, suffix) {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(blob);
-  link.download = `${scene.title.replace(/[^\p{L}\p{N}]+/gu, "-").replace(/^-|-$/g, "")}.${suffix}`;
+  const name = scene.title.replace(/[^\p{L}\p{N}]+/gu, "-").replace(/^-|-$/g, "");
+  const link = make("a", { href: URL.createObjectURL(blob), download: `${name}.${suffix}` });
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 }
@@ -51,7 +50,7 @@ export function saveFilm(viewer) {
   viewer.draw();
   compose(viewer, canvas);
   const type = ["video/webm;codecs=vp9", "video/webm", "video/mp4"].find((each) => window.MediaRecorder?.isTypeSupported(each));
-  if (!type) return alert("This browser records no films: nmpm render writes them.");
+  if (!type) return viewer.say("This browser records no films: nmpm render writes them.");
   const recorder = new MediaRecorder(canvas.captureStream(), { mimeType: type, videoBitsPerSecond: 8e6 });
   recorder.ondataavailable = ({ data }) => parts.push(data);
   recorder.onstop = () => {

@@ -1,98 +1,50 @@
-// The viewer: playing, choices, keys, and what is drawn.
+// The page that plays the trajectories that it contains: time, choices, what is drawn, and the particle under the pointer.
 
-import { Camera, panelRectangles } from "./camera.js";
-import { digits, drawCurve, frameAt } from "./chart.js";
-import { DISC_DIAMETER, Drawing, MODES } from "./drawing.js";
+import { flattened } from "./camera.js";
+import { drawCurve, frameAt } from "./chart.js";
+import { DISC_DIAMETER, MODES } from "./drawing.js";
 import { Ensemble } from "./ensemble.js";
-import { colourLegend, gravityNote } from "./legend.js";
-import { flatten, multiply } from "./matrices.js";
-import { Pointer } from "./picking.js";
+import { Page, next } from "./page.js";
 import { saveFilm, saveGif, savePicture } from "./saving.js";
-import { MOST_PIXELS, THEME_COLOURS, element, inflate, readColour, readField, readTrajectory, scene, undoDifferences } from "./scene.js";
+import { ABSENT, coloursOf, digits, element, inflate, make, scene, unpack } from "./scene.js";
 
 const RATES = [5, 15, 30, 60, 120, 240];
+const PICKED = 6; // pixels around the pointer within which a particle is always found
 
-class Viewer {
+class Viewer extends Page {
   /**
-   * @param fields For each field of the scene, values of each trajectory or null; @param members further ones;
-   * @param materials index of each particle's material.
+   * @param trajectories Positions of each; @param fields for each field of the scene, values of each trajectory or null;
+   * @param members positions of further members; @param materials index of each particle's material.
    */
-  constructor(drawing, trajectories, fields, members, materials) {
-    Object.assign(this, { drawing, trajectories, fields, materials, frame: 0, playing: false, drawn: 0, camera: new Camera() });
-    this.setTheme(matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
-    this.fillChoices();
-    if (members.length) this.ensemble = new Ensemble(drawing, trajectories.at(-1), members);
-    this.listen();
-    this.pointer = new Pointer(this);
-    new ResizeObserver(() => this.show()).observe(element("scene"));
-    const moves = scene.frames > 1, alone = scene.materials.length === 1 && !members.length;
-    this.setColour(moves && alone ? "speed" : "material");
+  constructor(obstacles, trajectories, fields, members, materials) {
+    super(obstacles);
+    Object.assign(this, { trajectories, fields, materials, frame: 0, playing: false, pointer: null });
+    this.drawing.setColours(coloursOf(materials));
+    const alone = trajectories.length === 1, moves = scene.frames > 1;
+    element("colour").replaceChildren(
+      ...["material", "speed", ...(alone ? [] : ["error"])].map((name) => new Option(name, name)),
+      ...scene.fields.map(({ name }, index) => new Option(name, `field ${index}`)));
+    element("rate").replaceChildren(...RATES.map((rate) =>
+      new Option(`${Number((rate * scene.dt).toPrecision(2))} × real time`, rate, rate === 60, rate === 60)));
+    element("layout-choice").hidden = element("errors").hidden = alone;
+    element("slider").max = scene.frames - 1;
+    if (members.length) this.ensemble = new Ensemble(this.drawing, [trajectories.at(-1), ...members]);
+    this.canvas.addEventListener("pointerdown", ({ pointerId }) => this.canvas.setPointerCapture(pointerId));
+    this.canvas.addEventListener("pointermove", (event) => this.follow(event));
+    this.canvas.addEventListener("pointerleave", () => this.follow(null));
+    this.canvas.addEventListener("wheel", (event) => this.zoom(event));
+    this.setColour(moves && scene.materials.length === 1 && !members.length ? "speed" : "material");
     this.seek(0);
     if (moves && !matchMedia("(prefers-reduced-motion: reduce)").matches) this.toggle();
   }
 
+  // Time.
+
   get frames() { return scene.frames; }
-  get colour() { return element("colour").value; }
-  get fieldIndex() { return Number(this.colour.replace("field ", "")); }
-  get mode() { return this.colour.startsWith("field ") ? MODES.field : MODES[this.colour]; }
-  get layout() { return element("layout").value; }
   get rate() { return Number(element("rate").value); }
 
-  fillChoices() {
-    const many = scene.trajectories.length > 1;
-    const names = ["material", "speed", ...(many ? ["error"] : [])];
-    const own = scene.fields.map(({ name }, index) => new Option(name, `field ${index}`));
-    element("title").textContent = document.title = scene.title;
-    element("colour").replaceChildren(...names.map((name) => new Option(name, name)), ...own);
-    element("rate").replaceChildren(...RATES.map((rate) =>
-      new Option(`${Number((rate * scene.dt).toPrecision(2))} × real time`, rate, rate === 60, rate === 60)));
-    element("layout-choice").hidden = !many;
-    element("errors").hidden = !many;
-    element("slider").max = scene.frames - 1;
-  }
-
-  listen() {
-    const on = (id, event, action) => element(id).addEventListener(event, action);
-    on("play", "click", () => this.toggle());
-    on("slider", "input", () => this.stopAt(Number(element("slider").value)));
-    on("colour", "change", () => this.setColour(this.colour));
-    on("layout", "change", () => this.show());
-    on("members", "change", () => this.setMembers(this.ensemble.mode));
-    on("quantity", "change", () => this.show());
-    on("reset", "click", () => this.reset());
-    on("theme", "click", () => this.turnTheme());
-    on("help", "click", () => element("keys").showModal());
-    on("curve", "click", (event) => this.stopAt(frameAt(element("curve"), event.offsetX)));
-    on("picture", "click", () => savePicture(this));
-    on("film", "click", () => saveFilm(this));
-    on("gif", "click", () => saveGif(this));
-    document.addEventListener("keydown", (event) => this.press(event));
-  }
-
-  press(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey || element("keys").open) return;
-    if (event.target.tagName === "SELECT" && event.key !== "Escape") return;
-    if (event.target.tagName === "BUTTON" && event.key === " ") return; // it presses the button
-    const step = event.shiftKey ? 10 : 1;
-    const actions = {
-      " ": () => this.toggle(), ArrowRight: () => this.stopAt(this.frame + step), ArrowLeft: () => this.stopAt(this.frame - step),
-      Home: () => this.stopAt(0), End: () => this.stopAt(this.frames - 1), "[": () => this.changeRate(-1), "]": () => this.changeRate(1),
-      c: () => this.setColour(next(element("colour"))), o: () => this.setLayout(next(element("layout"))),
-      m: () => this.ensemble && this.setMembers(next(element("members"))), r: () => this.reset(), t: () => this.turnTheme(), f: () => document.documentElement.requestFullscreen(),
-      p: () => savePicture(this), v: () => saveFilm(this), g: () => saveGif(this),
-      "?": () => element("keys").showModal(),
-    };
-    const action = actions[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-    if (!action) return;
-    event.preventDefault();
-    action();
-  }
-
   toggle() {
-    this.playing = !this.playing;
-    element("play").classList.toggle("playing", this.playing);
-    element("play").setAttribute("aria-label", this.playing ? "Pause" : "Play");
-    if (!this.playing) return;
+    this.showPlaying(!this.playing);
     let last = performance.now(), due = 0;
     const tick = (now) => {
       if (!this.playing) return;
@@ -120,153 +72,55 @@ class Viewer {
     this.show();
   }
 
-  setColour(name) {
-    element("colour").value = name;
+  forth({ shiftKey }) { this.stopAt(this.frame + (shiftKey ? 10 : 1)); }
+  back({ shiftKey }) { this.stopAt(this.frame - (shiftKey ? 10 : 1)); }
+  toFirst() { this.stopAt(0); }
+  toLast() { this.stopAt(this.frames - 1); }
+  toSlider() { this.stopAt(Number(element("slider").value)); }
+  toChart({ offsetX }) { this.stopAt(frameAt(element("curve"), offsetX)); }
+  slower() { element("rate").selectedIndex = Math.max(element("rate").selectedIndex - 1, 0); }
+  faster() { element("rate").selectedIndex = Math.min(element("rate").selectedIndex + 1, RATES.length - 1); }
+
+  // Choices.
+
+  nextLayout() {
+    if (this.trajectories.length > 1) element("layout").value = next(element("layout"));
+    this.show();
+  }
+
+  nextMembers() {
+    if (this.ensemble) element("members").value = next(element("members"));
     this.showLegend();
-    this.show();
   }
 
-  setLayout(name) {
-    if (scene.trajectories.length < 2) return;
-    element("layout").value = name;
-    this.show();
+  legend() { return [...super.legend(), ...(this.ensemble?.legend(this.theme) ?? [])]; }
+  fillScreen() { document.documentElement.requestFullscreen(); }
+  savePicture() { savePicture(this); }
+  saveFilm() { saveFilm(this); }
+  saveGif() { saveGif(this); }
+
+  // What is drawn.
+
+  /** Indices of the trajectories in each panel. */
+  get shown() {
+    const all = this.trajectories.map((_, index) => index);
+    return element("layout").value === "overlay" ? [all] : all.map((index) => [index]);
   }
 
-  setMembers(mode) {
-    element("members").value = mode;
-    this.showLegend();
-    this.show();
-  }
-
-  changeRate(by) {
-    const rates = element("rate");
-    rates.selectedIndex = Math.min(Math.max(rates.selectedIndex + by, 0), RATES.length - 1);
-  }
-
-  reset() {
-    this.camera.reset();
-    this.show();
-  }
-
-  turnTheme() {
-    this.setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
-    this.showLegend();
-    this.show();
-  }
-
-  setTheme(name) {
-    document.documentElement.dataset.theme = name;
-    const style = getComputedStyle(document.documentElement);
-    this.theme = Object.fromEntries(
-      THEME_COLOURS.map((colour) => [colour, readColour(style.getPropertyValue(`--${colour}`).trim())]));
-  }
-
-  /** The panels, in pixels of the page: which trajectories each shows, and where it lies. */
-  panels() {
-    const canvas = element("scene"), all = this.trajectories.map((_, index) => index);
-    const shown = this.layout === "overlay" ? [all] : all.map((index) => [index]);
-    const places = panelRectangles(shown.length, canvas.clientWidth, canvas.clientHeight - 26, this.camera.aspect);
-    return shown.map((indices, i) => {
-      const [x, y, width, height] = places[i];
-      return { indices, x, y: y + 26, width, height: height - (places.at(-1)[1] > 0 ? 26 : 0) };
-    });
-  }
-
-  /** Draws once before the next refresh of the screen, however often it is asked for. */
-  show() {
-    if (this.waiting) return;
-    this.waiting = true;
-    requestAnimationFrame(() => {
-      this.waiting = false;
-      this.draw();
-    });
+  labelOf(indices) {
+    const names = indices.map((index) => (index === this.ensemble?.index ? this.ensemble.label : scene.trajectories[index].label));
+    const over = this.ensemble?.isDensity ? `${names[0]} (dots) over ${names[1]}` : `${names.slice(1).join(", ")} over ${names[0]} (grey)`;
+    const label = names.length < 2 ? names[0] : over;
+    if (scene.tilt === null) return [label];
+    return [label, make("small", {}, "gravity ", make("i", { style: `transform: rotate(${-scene.tilt}rad)` }, "↓"))];
   }
 
   draw() {
-    const canvas = element("scene"), ratio = Math.min(devicePixelRatio, MOST_PIXELS);
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((length) => Math.round(length * ratio));
-    // Setting a size, even the same, would allocate the picture anew.
-    if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    const gl = this.drawing.gl;
-    gl.disable(gl.SCISSOR_TEST);
-    gl.clearColor(...this.theme.page, 1);
-    gl.clear(gl.COLOR_BUFFER_BIT);
-    const panels = this.panels();
-    panels.forEach((panel) => this.drawPanel(panel, canvas.height, ratio));
-    this.placeLabels(panels);
-    this.drawChart();
-    this.pointer.showParticle();
-    this.drawn += 1;
-    this.onDrawn?.();
-  }
-
-  drawPanel({ indices, x, y, width, height }, canvasHeight, ratio) {
-    const pixels = [x, canvasHeight / ratio - y - height, width, height].map((value) => Math.round(value * ratio));
-    const { matrix, unit } = this.camera.view(width, height);
-    const look = { mode: this.mode, top: this.top(), plain: [0, 0, 0, 1], diameter: DISC_DIAMETER * scene.spacing * unit * ratio };
-    const ensemble = indices.includes(this.ensemble?.index) ? this.ensemble : null;
-    this.drawing.startPanel(pixels, matrix, this.theme);
-    ensemble?.drawBehind(this.frame, matrix);
-    this.drawing.drawObstacles(matrix, { ...look, mode: MODES.plain, plain: [...this.theme.ghost, 1] });
-    if (scene.dim === 3) this.drawShadow(indices.at(-1), matrix, look);
-    for (const index of indices) {
-      const chosen = this.fieldLook(index === 0 ? this.referenceLook(look, indices.length > 1) : look, index);
-      if (index === ensemble?.index) ensemble.draw(this.trajectories[0], this.frame, matrix, chosen);
-      else this.drawing.drawFrame(this.trajectories[index], this.trajectories[0], this.frame, matrix, chosen);
-    }
-  }
-
-  /** On the floor, straight below the particles. */
-  drawShadow(index, matrix, look) {
-    if (this.camera.tilt < 0) return;
-    const shadow = { ...look, flat: true, mode: MODES.plain, plain: [...this.theme.wall, 1] }, flat = flatten(scene.up, scene.bounds[scene.up][0]);
-    this.drawing.drawFrame(this.trajectories[index], this.trajectories[0], this.frame, multiply(matrix, flat), shadow);
-    this.drawing.gl.clear(this.drawing.gl.DEPTH_BUFFER_BIT);
-  }
-
-  /** With a trajectory's values of the chosen field; one without the field has the colours of its materials. */
-  fieldLook(look, index) {
-    if (look.mode !== MODES.field) return look;
-    const field = this.fields[this.fieldIndex][index];
-    return field ? { ...look, field } : { ...look, mode: MODES.material };
-  }
-
-  /** How the first trajectory is drawn: grey under another, dark over a density; without error, of which it has none. */
-  referenceLook(look, under) {
-    if (this.trajectories.length < 2) return look;
-    if (under && this.ensemble?.isDensity)
-      return { ...look, mode: MODES.plain, plain: [...this.theme.text, 0.8], diameter: 0.6 * look.diameter };
-    if (under) return { ...look, mode: MODES.plain, plain: [...this.theme.ghost, 0.7] };
-    return look.mode === MODES.error ? { ...look, mode: MODES.material } : look;
-  }
-
-  /** What the upper end of the colour scale stands for, in domain lengths. */
-  top() {
-    return this.colour === "speed" ? scene.fastest : scene.worst;
-  }
-
-  placeLabels(panels) {
-    element("labels").replaceChildren(...panels.map(({ indices, x, y, width }) => {
-      const label = document.createElement("span"), names = indices.map((index) => this.nameOf(index));
-      label.textContent = names.length < 2 ? names[0]
-        : this.ensemble?.isDensity ? `${names[0]} (dots) over ${names[1]}` : `${names.slice(1).join(", ")} over ${names[0]} (grey)`;
-      label.style.left = `${x + width / 2}px`;
-      label.style.maxWidth = `${width - 8}px`;
-      label.style.top = `${y - 24}px`;
-      if (scene.tilt !== null) label.append(gravityNote(scene.tilt));
-      return label;
-    }));
-  }
-
-  nameOf(index) {
-    return index === this.ensemble?.index ? this.ensemble.label : scene.trajectories[index].label;
-  }
-
-  drawChart() {
+    super.draw();
     const chart = this.ensemble ? this.ensemble.chart(this.frame, this.theme) : this.errorChart();
-    if (!chart.lines.length) return;
-    drawCurve(element("curve"), chart, this.frame, this.theme);
+    if (chart.lines.length) drawCurve(element("curve"), chart, this.frame, this.theme);
     element("now").textContent = chart.now.join("\n");
+    this.showParticle();
   }
 
   errorChart() {
@@ -276,25 +130,111 @@ class Viewer {
     return { title: "root mean square position error (length), by frame", bands: [], lines, now };
   }
 
-  showLegend() {
-    element("legend").replaceChildren(...colourLegend(this), ...(this.ensemble?.legend(this.theme) ?? []));
+  /** The numbers of a trajectory, or of a field, at a frame. */
+  part(values, frame) {
+    const length = values.length / scene.frames;
+    return values.subarray(frame * length, (frame + 1) * length);
+  }
+
+  /** What is drawn of a trajectory at the frame that is shown; at frame 0 speeds are those toward frame 1. */
+  frameOf(positions, field) {
+    const [position, previous, reference] = [
+      this.part(positions, this.frame), this.part(positions, this.frame > 0 ? this.frame - 1 : Math.min(1, scene.frames - 1)),
+      this.part(this.trajectories[0], this.frame),
+    ];
+    return { position, previous, reference, field: field && this.part(field, this.frame) };
+  }
+
+  drawBehind(indices, matrix) {
+    if (this.ensemble?.isDensity && indices.includes(this.ensemble.index)) this.ensemble.density.draw(this.frame, matrix);
+  }
+
+  drawContents(indices, matrix, plainLook) {
+    const look = { ...plainLook, top: this.colour === "speed" ? scene.fastest : scene.worst };
+    if (scene.dim === 3 && this.camera.tilt >= 0) this.drawShadow(this.trajectories[indices.at(-1)], matrix, look);
+    for (const index of indices) {
+      const field = look.mode === MODES.field && this.fields[Number(this.colour.replace("field ", ""))][index];
+      const coloured = look.mode === MODES.field && !field ? { ...look, mode: MODES.material } : look;
+      const changed = index === 0 && this.trajectories.length > 1 ? this.referenceLook(coloured, indices.length > 1) : coloured;
+      const frameOf = (positions) => this.frameOf(positions, field);
+      if (index === this.ensemble?.index) this.ensemble.draw(frameOf, matrix, changed);
+      else this.drawing.drawFrame(frameOf(this.trajectories[index]), matrix, changed);
+    }
+  }
+
+  /** Draws a shadow on the floor, straight below the particles. */
+  drawShadow(positions, matrix, look) {
+    const gl = this.drawing.gl, flat = flattened(matrix, scene.up, scene.bounds[scene.up][0]);
+    this.drawing.drawFrame(this.frameOf(positions), flat, { ...look, flat: true, mode: MODES.plain, plain: [...this.theme.wall, 1] });
+    gl.clear(gl.DEPTH_BUFFER_BIT);
+  }
+
+  /** How the first trajectory is drawn: grey under another, dark over a density; without error, of which it has none. */
+  referenceLook(look, under) {
+    if (under && this.ensemble?.isDensity)
+      return { ...look, mode: MODES.plain, plain: [...this.theme.text, 0.8], diameter: 0.6 * look.diameter };
+    if (under) return { ...look, mode: MODES.plain, plain: [...this.theme.ghost, 0.7] };
+    return look.mode === MODES.error ? { ...look, mode: MODES.material } : look;
+  }
+
+  // The pointer.
+
+  /** Turns or moves while a button is down; else shows the particle that the pointer is at. */
+  follow(event) {
+    this.pointer = event && !event.buttons ? event : null;
+    if (event?.buttons) return this.drag(event);
+    if (!this.playing) this.showParticle();
+  }
+
+  showParticle() {
+    const note = element("particle"), picked = this.pointer && this.pick(this.pointer);
+    note.hidden = !picked;
+    if (!picked) return;
+    const { number, positions, x, y } = picked, speed = this.stepOf(positions, number) / scene.dt;
+    note.textContent = `particle ${number}, ${scene.materials[this.materials[number]].name}, ${digits(speed, 3)} length/s`;
+    note.style.transform = `translate(${Math.min(x + 12, this.canvas.clientWidth - note.offsetWidth - 4)}px, ${Math.max(y - 30, 0)}px)`;
+  }
+
+  /** The particle at a point of the canvas, in 3-D the nearest to the viewer; null where there is none. */
+  pick({ offsetX, offsetY }) {
+    const panel = this.panelUnder({ offsetX, offsetY }), positions = this.trajectories[panel.shown.at(-1)];
+    const pixelOf = this.projection(panel);
+    let best = null;
+    for (let number = 0; number < positions.length / scene.frames / scene.dim; number++) {
+      const point = this.pointOf(positions, this.frame, number);
+      if (Number.isNaN(point[0])) continue;
+      const [x, y, depth, unit] = pixelOf(point), away = Math.hypot(x - offsetX, y - offsetY);
+      const order = scene.dim === 2 ? away : depth;
+      if (away < Math.max(PICKED, (DISC_DIAMETER * scene.spacing * unit) / 2) && !(best?.order <= order))
+        best = { number, positions, order, x, y };
+    }
+    return best;
+  }
+
+  /** A particle's position in domain lengths; NaN where it is not there. */
+  pointOf(positions, frame, number) {
+    const at = (positions.length / scene.frames) * frame + number * scene.dim;
+    return scene.low.map((low, axis) => (positions[at] === ABSENT ? NaN : low + ((scene.high[axis] - low) * positions[at + axis]) / 65535));
+  }
+
+  /** The distance that a particle moves to this frame from the one before. */
+  stepOf(positions, number) {
+    const [now, before] = [Math.max(this.frame, Math.min(1, scene.frames - 1)), Math.max(this.frame - 1, 0)];
+    const from = this.pointOf(positions, before, number);
+    return Math.hypot(...this.pointOf(positions, now, number).map((value, axis) => {
+      const moved = value - from[axis], period = scene.period[axis];
+      return period ? moved - period * Math.round(moved / period) : moved;
+    }));
   }
 }
 
-/** The option after the chosen one, in a circle. */
-const next = (choice) => choice.options[(choice.selectedIndex + 1) % choice.options.length].value;
-
 async function start() {
-  const trajectories = await Promise.all(scene.trajectories.map(readTrajectory));
-  const obstacles = undoDifferences(await inflate(scene.obstacles), 1);
-  const members = await Promise.all(scene.members.map(readTrajectory));
-  const materials = await inflate(scene.particles), colours = scene.materials.map(({ colour }) => readColour(colour).map((value) => 255 * value));
-  const drawing = new Drawing(element("scene"), Uint8Array.from([...materials].flatMap((index) => colours[index])), obstacles);
-  const fields = await Promise.all(scene.fields.map(({ values }) => Promise.all(values.map(readField))));
-  window.viewer = new Viewer(drawing, trajectories, fields, members, materials);
-  element("message").hidden = true;
+  const unpackAll = (texts) => Promise.all(texts.map((text) => unpack(text, scene.frames)));
+  const positionsOf = (each) => unpackAll(each.map(({ positions }) => positions));
+  const [obstacles, trajectories, members, materials, fields] = await Promise.all([
+    unpack(scene.obstacles, 1), positionsOf(scene.trajectories), positionsOf(scene.members), inflate(scene.particles),
+    Promise.all(scene.fields.map(({ values }) => unpackAll(values)))]);
+  window.viewer = new Viewer(obstacles, trajectories, fields, members, materials);
 }
 
-start().catch((error) => {
-  element("message").textContent = error.message;
-});
+start().catch((error) => (element("message").textContent = error.message));
