@@ -32,7 +32,7 @@ ABSENT = 65535
 
 IMPORT = re.compile(r'^import {([^}]*)} from "\./(\w+)\.js";$', re.MULTILINE)
 EXPORT = re.compile(r"^export ((?:async )?(?:function|class|const) (\w+))", re.MULTILINE)
-ONLY = re.compile(r"<!--only ([a-z ]+)-->\n?(.*?)<!--end-->\n?", re.DOTALL)
+ONLY = re.compile(r"<!-- only ([a-z ]+) -->\n?(.*?)<!-- end -->\n?", re.DOTALL)
 
 
 def make_page(mode: str, data: Mapping[str, Any]) -> str:
