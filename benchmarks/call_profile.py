@@ -24,7 +24,7 @@ from timing import clock_for, describe_machine, make_timing_parser, time_alterna
 import nmpm
 from nmpm.emulator import Emulator, RolloutContext
 from nmpm.emulator.engines import find_engine
-from nmpm.evaluation.stress import ModelUnderTest
+from nmpm.evaluation.stress.model import ModelUnderTest
 from nmpm.particles import Particles
 from nmpm.sim import load_preset
 from nmpm.zoo import Zoo

@@ -28,8 +28,9 @@ from nmpm import (
 )
 from nmpm.cli.command import sections
 from nmpm.cli.training import OPTIONS_FILE
+from nmpm.training import losses
 
-PARTS = (processors, transfer, decoders, optimizers, metrics)
+PARTS = (processors, transfer, decoders, losses, optimizers, metrics)
 """Modules whose classes are named in configurations."""
 TRAINER = {
     "default_root_dir": "folder of the run's files; further runs go to its version_1, version_2, ...",
@@ -61,7 +62,7 @@ def training_options() -> dict[str, Any]:
     known["classes"] = {module.__name__: _classes(module) for module in PARTS}
     known["parts"] = {
         name: f"model.{part}.{name}"
-        for part, module in (("processor", processors), ("transfer", transfer), ("decoder", decoders))
+        for part, module in (("processor", processors), ("transfer", transfer), ("decoder", decoders), ("loss", losses))
         for kind in _classes(module)
         for name, parameter in inspect.signature(getattr(module, kind)).parameters.items()
         if parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
@@ -80,10 +81,9 @@ def _described(parameter: inspect.Parameter) -> dict[str, str | None]:
 
 
 def _classes(module: ModuleType) -> list[str]:
-    """Names of the classes of nmpm in a module."""
+    """Names of the classes of a module of nmpm."""
     kinds = [kind for kind in vars(module).values() if isinstance(kind, type)]
-    own = [kind for kind in kinds if kind.__module__.startswith("nmpm.") and not issubclass(kind, Exception)]
-    return sorted({kind.__name__ for kind in own})
+    return sorted({kind.__name__ for kind in kinds if kind.__module__.startswith(module.__name__)})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Contracts as tests: subclass them to check a processor or a transfer of your own.
+"""Contracts as tests: subclass them to check a processor, a transfer or a loss of your own.
 
     class TestMine(ProcessorContract):
         recipe = Mine(width=8)
@@ -9,6 +9,7 @@ They need pytest, which the package itself does not.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from functools import partial
 from typing import ClassVar
@@ -17,9 +18,14 @@ import torch
 from torch import Tensor
 
 from nmpm._support.plain_data import from_spec, to_spec
+from nmpm.emulator import Emulator, EmulatorRecipe, Rollout
+from nmpm.errors import ConfigError
 from nmpm.grid import Grid
-from nmpm.processors import GridLayout, GridProcessor, Processor
+from nmpm.particles import Window
+from nmpm.processors import GridLayout, GridProcessor, Identity, Processor
 from nmpm.processors.channels import ChannelChange, OutputSource
+from nmpm.scene import Scene
+from nmpm.training.losses import Loss
 from nmpm.transfer import Transfer
 
 
@@ -273,3 +279,107 @@ class TransferContract:
 
     def test_survives_as_plain_data(self) -> None:
         assert from_spec(to_spec(self.transfer), Transfer) == self.transfer
+
+
+class LossContract:
+    """The contract of training losses.
+
+    Args:
+        loss: The loss under test.
+        dims: Of the scenes.
+    """
+
+    loss: ClassVar[Loss]
+    dims: ClassVar[tuple[int, ...]] = (2, 3)
+
+    def emulator(self, dim: int) -> Emulator:
+        """An emulator of bundles of two frames, for a box of particles of one material with a temperature."""
+        scene = Scene(
+            ((0.1, 0.9),) * dim, ((0.0, 1.0),) * dim, 0.01, ("water",), 0.05**dim, gravity=(0.0,) * dim,
+            evolving=("temperature",),
+        )  # fmt: skip
+        return EmulatorRecipe(scene, cells=16, frames=2, processor=Identity()).build()
+
+    def window(self, dim: int, batch: int = 2, count: int = 12) -> Window:
+        """Particles that move slowly, over four frames to predict."""
+        generator = torch.Generator().manual_seed(0)
+        path = torch.randn(batch, 6, count, dim, generator=generator).cumsum(1)
+        return Window(
+            frames=0.5 + 0.01 * path + 0.1 * torch.randn(batch, 1, count, dim, generator=generator),
+            material=torch.zeros(batch, count, dtype=torch.long),
+            mask=torch.ones(batch, count, dtype=torch.bool),
+            obstacle=torch.zeros(batch, 0, dim),
+            obstacle_mask=torch.ones(batch, 0, dtype=torch.bool),
+            gravity=torch.zeros(batch, dim),
+            fields={"temperature": torch.randn(batch, 6, count, generator=generator)},
+        )
+
+    def predicted(self, window: Window, off: float, members: int = 1) -> Rollout:
+        """The frames to predict, off by so many domain lengths, with gradients."""
+        generator = torch.Generator().manual_seed(1)
+        target, field = (v.repeat_interleave(members, 0) for v in (window.target, window.field_target("temperature")))
+        position = target + off * torch.randn(target.shape, generator=generator)
+        fields = {"temperature": (field + off * torch.randn(field.shape, generator=generator)).requires_grad_()}
+        return Rollout(position.requires_grad_(), fields)
+
+    def test_is_one_number_least_at_the_truth_and_with_gradients_that_lead_there(self) -> None:
+        for dim in self.dims:
+            emulator, window = self.emulator(dim), self.window(dim)
+            losses = [self.loss(self.predicted(window, off), window, emulator) for off in (0.0, 0.01, 0.03)]
+            assert all(loss.shape == () and loss.isfinite() for loss in losses)
+            assert losses[0] < losses[1] < losses[2]
+            predicted = self.predicted(window, 0.03)
+            (slope,) = torch.autograd.grad(self.loss(predicted, window, emulator), predicted.position)
+            nearer = predicted.position - 0.003 * slope / slope.abs().max()
+            assert self.loss(predicted._replace(position=nearer), window, emulator) < losses[2]
+
+    def test_gradients_are_finite_at_the_truth(self) -> None:
+        for dim in self.dims:
+            window = self.window(dim)
+            predicted = self.predicted(window, 0.0)
+            self.loss(predicted, window, self.emulator(dim)).backward()
+            assert predicted.position.grad is not None
+            assert predicted.position.grad.isfinite().all()
+
+    def test_padding_and_frames_that_nobody_observed_do_not_count(self) -> None:
+        for dim in self.dims:
+            window = self.window(dim)
+            padded, hidden = window.mask.clone(), torch.ones(2, 6, dtype=torch.bool)
+            padded[:, -3:], hidden[:, 3] = False, False
+            for case, mute in (
+                (dataclasses.replace(window, mask=padded), (slice(None), slice(None), slice(-3, None))),
+                (dataclasses.replace(window, observed=hidden), (slice(None), 1)),
+            ):
+                predicted = self.predicted(case, 0.01)
+                loss = self.loss(predicted, case, self.emulator(dim))
+                (slope,) = torch.autograd.grad(loss, predicted.position)
+                assert loss > 0
+                assert slope.any()
+                assert not slope[mute].any()
+
+    def test_the_loss_of_a_batch_is_the_mean_over_particles_of_those_of_its_windows(self) -> None:
+        for dim in self.dims:
+            emulator, window = self.emulator(dim), self.window(dim)
+            window.mask[1, 4:] = False
+            predicted = self.predicted(window, 0.01)
+
+            heat, alone = predicted.fields["temperature"], []
+            for row in ([0], [1]):
+                rollout = Rollout(predicted.position[row], {"temperature": heat[row]})
+                alone.append(self.loss(rollout, window.scenes(row), emulator))
+            mean = (12 * alone[0] + 4 * alone[1]) / 16
+            torch.testing.assert_close(self.loss(predicted, window, emulator), mean, rtol=1e-4, atol=1e-7)
+
+    def test_several_members_have_one_loss_or_are_refused(self) -> None:
+        try:
+            self.loss.check_members(2)
+        except ConfigError:
+            return
+        for dim in self.dims:
+            window = self.window(dim)
+            near, far = (self.loss(self.predicted(window, off, 2), window, self.emulator(dim)) for off in (0.01, 0.1))
+            assert near.shape == ()
+            assert near < far
+
+    def test_survives_as_plain_data(self) -> None:
+        assert from_spec(to_spec(self.loss), Loss) == self.loss

@@ -16,6 +16,7 @@ from nmpm.metrics import MSE
 from nmpm.optimizers import SOAP
 from nmpm.processors import FNO, Processor, UNet
 from nmpm.training import EmulatorModule
+from nmpm.training.losses import PositionLoss
 from nmpm.transfer import Affine, Linear, Quadratic, Transfer, scatter_backend, without_kernels
 from nmpm.zoo import Zoo
 
@@ -95,7 +96,7 @@ def fit(folder: Path, root: Path, device: torch.device, steps: int, **options) -
     torch.manual_seed(0)
     module = EmulatorModule(
         data.scene, cells=8, frames=2, unroll=2, processor=SMALL, optimizer=SOAP, metrics=[MSE((1, 4))], mirror=(0,),
-        jitter=0.2, position_noise=1e-4, density_weight=1.0,
+        jitter=0.2, position_noise=1e-4, loss=PositionLoss(density_weight=1.0),
     )  # fmt: skip
     trainer = lightning.Trainer(
         accelerator="gpu" if device.type == "cuda" else device.type, devices=1, max_steps=steps, logger=False,

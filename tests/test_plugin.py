@@ -18,7 +18,8 @@ from nmpm._support.shipped import PACKAGE
 def nmpm(tmp_path_factory):
     """Runs a command beside the installed package, in a folder with frames in its format; gives status and output."""
     text = (PACKAGE.parent / "docs" / "howto" / "plugin.md").read_text("utf-8")
-    project, code = (re.search(rf"```{language}\n(.*?)```", text, re.DOTALL)[1] for language in ("toml", "python"))
+    project = re.search(r"```toml\n(.*?)```", text, re.DOTALL)[1]
+    code = "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
     plain = tomllib.loads(project)["project"]
     site, work = tmp_path_factory.mktemp("site"), tmp_path_factory.mktemp("work")
     (site / "nmpm_points.py").write_text(code, "utf-8")
@@ -97,3 +98,19 @@ def test_a_command_has_help_and_checks(nmpm):
     assert nmpm("weight")[1].startswith("nmpm: there is no command 'weight'; did you mean weigh?")
     assert nmpm("weigh", "run/000.f4", "--densty", "2")[0] == 2
     assert nmpm("weigh", "run/000.f4")[1] == "50000\n"
+
+
+def test_a_group_of_stress_tests_runs(nmpm):
+    assert "drop" in nmpm("stress", "--help")[1]
+    status, text = nmpm("stress", "goop", "--groups", "drop")
+    assert (status, "1 passed, 0 failed." in text) == (0, True), text
+
+
+def test_a_loss_and_a_metric_train_and_are_read_back(nmpm):
+    counts = ("--data.generate.counts", "{train: 1, valid: 0, test: 1}", "--trainer.limit_val_batches", "0")
+    parts = ("--model.loss", "nmpm_points.Doubled", "--model.metrics+", "nmpm_points.First")
+    short = ("--model.cells", "16", "--trainer.max_steps", "1", "--trainer.default_root_dir", "trained")
+    status, text = nmpm("fit", "--data.name", "splash", *counts, *parts, *short)
+    assert (status, "mse@1" in text, "mse@8" in text) == (0, True, False), text
+    status, text = nmpm("test", "trained", "--trust_config")
+    assert (status, "mse@1" in text) == (0, True), text

@@ -34,20 +34,17 @@ from nmpm.cli.options import (
     describe,
 )
 from nmpm.errors import ConfigError
+from nmpm.evaluation.stress import GROUPS
 
 if TYPE_CHECKING:
-    from nmpm.evaluation.stress import ModelUnderTest, TestResult
+    from nmpm.evaluation.stress.model import ModelUnderTest
+    from nmpm.evaluation.stress.results import TestResult
     from nmpm.zoo import Pretrained
-
-GROUP_NAMES = (
-    *("long", "settling", "speeds", "counts", "sizes", "precision", "sensitivity", "obstacles", "poison", "free"),
-)
-"""Groups of `nmpm.evaluation.stress`, which imports torch."""
 
 
 def _check_groups(option: str, names: list[str]) -> None:
-    if unknown := sorted(set(names) - set(GROUP_NAMES)):
-        raise ConfigError(f"{option} {' '.join(unknown)}: the groups are {', '.join(GROUP_NAMES)}.")
+    if unknown := sorted(set(names) - set(GROUPS)):
+        raise ConfigError(f"{option} {' '.join(unknown)}: the groups are {', '.join(GROUPS)}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,7 +84,7 @@ class Stress(ModelOptions, DeviceOptions, ThreadsOptions, RuntimeOptions, Strict
 
     @classmethod
     def help_values(cls) -> Mapping[str, str]:
-        return {"groups": ", ".join(GROUP_NAMES)}
+        return {"groups": ", ".join(GROUPS)}
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -98,16 +95,16 @@ class Stress(ModelOptions, DeviceOptions, ThreadsOptions, RuntimeOptions, Strict
         from rich.console import Console
 
         from nmpm._support.progress import progress_bar
-        from nmpm.evaluation.stress import FULL, GROUPS, QUICK, battery
-        from nmpm.evaluation.stress.results import as_json, summary, table, write
+        from nmpm.evaluation.stress.model import battery
+        from nmpm.evaluation.stress.results import FULL, QUICK, as_json, summary, table, write
 
         model, start = self._model_under_test(), time.monotonic()
         results: list[TestResult] = []
-        groups = self.groups or GROUP_NAMES
+        groups = self.groups or list(GROUPS)
         with progress_bar("stress", len(groups)) as step:
             for name in groups:
                 step(f"stress, {name}", by=0)
-                results += battery(model, FULL if self.full else QUICK, {name: GROUPS[name]})
+                results += battery(model, FULL if self.full else QUICK, [name])
                 step()
         seconds, size = time.monotonic() - start, "full" if self.full else "quick"
         text = as_json(model.name, size, seconds, results)
@@ -125,7 +122,7 @@ class Stress(ModelOptions, DeviceOptions, ThreadsOptions, RuntimeOptions, Strict
     def _model_under_test(self) -> ModelUnderTest:
         """The model; on a preset's scenes, what matches them, where they are of another kind, is printed."""
         from nmpm.emulator.similarity import find_match
-        from nmpm.evaluation.stress import ModelUnderTest
+        from nmpm.evaluation.stress.model import ModelUnderTest
         from nmpm.scene import Motion
         from nmpm.sim import load_preset
         from nmpm.zoo import load_model

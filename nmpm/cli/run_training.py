@@ -29,6 +29,7 @@ from yaml import YAMLError
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.bounded_files import check_yaml
+from nmpm._support.former import with_loss
 from nmpm._support.machine import device_name, find_device
 from nmpm._support.messages import one_line
 from nmpm._support.plain_data import load_plugins
@@ -377,7 +378,10 @@ def load_checked(text: str) -> Any:
         rest, count = re.subn(r"\$\{[^${}:]*\}", "", rest)
     if left := re.search(r"\$\{[^}]*\}?", rest):
         raise ValueError(f"{one_line(left[0], 60)}: ${{…}} refers to other keys of the configuration, to nothing else.")
-    return _with_home(value)
+    value = _with_home(value)
+    if isinstance(value, dict) and isinstance(model := value.get("model"), dict):
+        value["model"] = with_loss(model)
+    return value
 
 
 def _with_home(value: Any) -> Any:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import yaml
 
 from nmpm._support.bounded_files import read_yaml
+from nmpm._support.former import LOSS_OPTIONS, with_loss
 from nmpm._support.messages import counted
 from nmpm._support.shipped import PACKAGE, check_dataset, find_config
 from nmpm.cli import expand_home
@@ -232,6 +233,8 @@ def read_options(words: Sequence[str], flags: Sequence[str] = ()) -> list[Option
             read = Option(name, rest.pop(0))
         else:
             read = Option(name)
+        if (former := read.name.removeprefix("--model.")) in LOSS_OPTIONS and former != read.name:
+            read = Option(f"--model.loss.init_args.{LOSS_OPTIONS[former]}", read.value)
         if read.name in ("--config", "-c") and read.value:
             read = Option("--config", str(find_config(read.value)))
         options.append(read)
@@ -257,9 +260,10 @@ def _type(argument: Mapping[str, Any]) -> Any:
 def read_config(path: Path) -> Mapping[str, Any]:
     """Read a configuration file; an empty mapping where it holds something else, UsageError if it is not YAML."""
     try:
-        return read_yaml(path)
+        config = dict(read_yaml(path))
     except DataError as error:
         raise UsageError(f"--config {error}") from error
+    return config | ({"model": with_loss(config["model"])} if isinstance(config.get("model"), Mapping) else {})
 
 
 def _configs(options: Sequence[Option]) -> list[Mapping[str, Any]]:

@@ -229,8 +229,6 @@ class SettingsChoice:
             yield "mirror", (str(axes), "few trajectories: mirror images double them")
         if self.transient and scene.bounds != scene.domain:
             yield "jitter", ("0.35", "cells by which the grid is moved at most: where cells lie should matter little")
-        if scene.evolving:
-            yield "field_weight", ("1.0", f"of the error of {', '.join(scene.evolving)}, beside positions")
 
     def _mirrors(self, axis: int) -> bool:
         scene = self.scene

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from nmpm._support.atomic import atomic_write
+from nmpm._support.former import with_loss
 from nmpm._support.messages import one_line
 from nmpm._support.plain_data import class_path, to_plain
 from nmpm.emulator import EmulatorRecipe
@@ -156,7 +157,7 @@ def adopt_arguments(checkpoint: Mapping[str, Any], current: Mapping[str, Any], o
     Raises:
         ConfigError: if the checkpoint has the state of another kind of optimizer.
     """
-    kind, stored = class_path(type(optimizer)), checkpoint["hyper_parameters"]
+    kind, stored = class_path(type(optimizer)), with_loss(checkpoint["hyper_parameters"])
     stored_kind = checkpoint.get("nmpm_optimizer", kind)
     if stored_kind != kind:
         raise ConfigError(

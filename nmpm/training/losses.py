@@ -1,19 +1,22 @@
-"""Training losses: squared errors of positions, of the density that they make on the grid, and of particles' fields.
+"""Training losses: what a step reduces, by class name (`model.loss`); of the package, or of others.
 
-The position errors of each window and bundle may be raised to a power below 1, so that splashes, whose errors nothing
-can reduce much, do not drown what can be learnt elsewhere.
-
-Where data have only some of the frames, these alone count; a bundle without any has no error.
+A loss is a mean over the particles that count: where data have only some of the frames, these alone count; a bundle
+without any has no error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
+from nmpm.emulator import Emulator, Rollout
 from nmpm.emulator.engines.rules import TRAINING_ERRORS, PositionPair, takes
 from nmpm.emulator.prescribed import predicted_particles
 from nmpm.errors import ConfigError
@@ -22,57 +25,123 @@ from nmpm.particles import Window, scene_volumes
 from nmpm.scene import Scene
 from nmpm.transfer import Linear
 
+T = TypeVar("T")
+
 _FLOOR = 1e-4
 """Cells², added to errors before they are raised to a power: below a hundredth of a cell errors no longer count."""
 
 
 @dataclass(frozen=True)
-class TrainingError:
-    """The position error, with the density error at the last frame of each bundle, of those that were observed.
+class Loss(ABC):
+    """A training loss; a subclass is a frozen dataclass of plain values, which checkpoints store.
 
-    Args:
-        density_weight: Weight of the density error beside the position error in cells².
-        power: In (0, 1]; below 1, the position error of each window and bundle is raised to it before the mean; the
-            density error, which keeps the volume of splashes, is not.
+    `nmpm.testing.LossContract` has the tests that every loss must pass.
     """
 
-    density_weight: float = 0.0
-    power: float = 1.0
+    @abstractmethod
+    def __call__(self, predicted: Rollout, window: Window, emulator: Emulator) -> Tensor:
+        """The loss (), a mean over the particles that count (`counted`), with gradients to the predictions.
+
+        Args:
+            predicted: (B M, K m, N, D) positions, and (B M, K m, N) evolving fields by name: M members of each window,
+                one after the other.
+            window: B recorded windows, of at least K m frames after the first two.
+            emulator: Has made the predictions: gives scene, grid, the m frames of a bundle, and the fields' scales.
+        """
+
+    def check_members(self, members: int) -> None:
+        """Raise ConfigError if this loss cannot train so many members of each window; by default, if several."""
+        if members < 1:
+            raise ConfigError(f"model.members = {members}: 1 is a deterministic model, 2 or more an ensemble.")
+        if members > 1:
+            raise ConfigError(f"model.members = {members}: {type(self).__name__} scores one prediction of each window.")
+
+
+@dataclass(frozen=True)
+class PositionLoss(Loss):
+    """Squared errors of positions, of the density that they make on the grid, and of evolving fields.
+
+    Several members are scored together: by their mean distance to the truth, less half of the mean distance between two
+    of them. In the mean it is least for members drawn from the distribution of the truth: neither too sure, nor too
+    vague. It is fair: its mean does not depend on the number of members. Distances are of single particles (the energy
+    score) and of single cells (the CRPS), each of which must be as uncertain as it is.
+
+    Sources: Gneiting & Raftery, Strictly proper scoring rules, prediction, and estimation, JASA 2007 (energy score);
+    Ferro, Fair scores for ensemble forecasts, QJRMS 2014.
+
+    Args:
+        power: In (0, 1], to which the position error, in cells², of each window and bundle is raised before the mean,
+            as are those of fields. At 0.5, calm windows and early bundles weigh as much as splashes, whose errors
+            nothing can reduce much; at 1, mean squares, which score no spread of members.
+        density_weight: Weight of the density error at each bundle's last frame, by which liquids keep their volume; 0
+            for none.
+        field_weight: Weight of the error of evolving fields, such as a temperature, in units of their spread.
+    """
+
+    power: float = 0.5
+    density_weight: float = 4.0
+    field_weight: float = 1.0
 
     def __post_init__(self) -> None:
         if not 0 < self.power <= 1:
-            raise ConfigError(f"model.error_power = {self.power} must be above 0 and at most 1.")
+            raise ConfigError(f"model.loss.power = {self.power} must be above 0 and at most 1.")
 
-    def __call__(self, predicted: Tensor, window: Window, scene: Scene, grid: Grid, frames: int) -> Tensor:
-        """The error () of predicted positions (B, K m, N, D), m frames to a bundle, as a mean over particles.
+    def check_members(self, members: int) -> None:
+        if members < 2:
+            super().check_members(members)
+        elif self.power == 1:
+            raise ConfigError("model.loss.power = 1 scores no spread: ensembles need less, such as 0.5.")
 
-        Raises:
-            ValueError: if the window has fewer frames than were predicted, or other particles.
-        """
-        target = window.target[:, : predicted.shape[1]]
-        error = self.of_positions(predicted, target, window, grid, frames)
-        if not self.density_weight:
-            return error
-        last, there = last_frames(window, predicted.shape[1], frames)
-        density = density_error(predicted[last], target[last], window, scene, grid, there)
-        return error + self.density_weight * density
+    def __call__(self, predicted: Rollout, window: Window, emulator: Emulator) -> Tensor:
+        scene, grid, bundle = emulator.scene, emulator.grid, emulator.frames
+        frames, count = predicted.position.shape[1], len(predicted.position) // len(window.mask)
+        members = [predicted.position] if count == 1 else predicted.position.unflatten(0, (-1, count)).unbind(1)
+        target = window.target[:, :frames]
+        check_comparable(members[0], target, bundle)
+        distance = self._window_error if count == 1 else self._particle_error
+        error = fair_score(members, target, partial(distance, window, grid, bundle))
+        if self.density_weight:
+            last, there = last_frames(window, frames, bundle)
+            ends, truth = [one[last] for one in members], target[last]
+            if count == 1:
+                density = density_error(ends[0], truth, window, scene, grid, there)
+            else:
+                density = density_score(ends, truth, window, scene, grid, there)
+            error = error + self.density_weight * density
+        if self.field_weight and predicted.fields:
+            names = [name for name in predicted.fields if name in window.fields]
+            split = {name: predicted.fields[name].unflatten(0, (-1, count)).unbind(1) for name in names}
+            fields = [{name: values[member] for name, values in split.items()} for member in range(count)]
+            true_fields = {name: window.field_target(name)[:, :frames] for name in names}
+            spread = emulator.field_scales.spread
+            of_fields = partial(field_error, window=window, spread=spread, frames=bundle, power=self.power)
+            error = error + self.field_weight * fair_score(fields, true_fields, of_fields)
+        return error
 
-    def of_positions(self, predicted: Tensor, target: Tensor, window: Window, grid: Grid, frames: int) -> Tensor:
-        """The error () of positions (B, K m, N, D) alone, against others of the window's particles."""
-        check_comparable(predicted, target, frames)
+    def _window_error(self, window: Window, grid: Grid, bundle: int, predicted: Tensor, target: Tensor) -> Tensor:
+        """The mean () over windows and bundles of the power of their position errors."""
         if _some_are_missing(window):
-            counts = counted(window, predicted.shape[1], frames)
+            counts = counted(window, predicted.shape[1], bundle)
             squared = grid.to_cell_displacement(predicted - target, predicted.dtype).square().mean(-1)
-            return _tempered_mean(squared, counts, frames, self.power)
+            return _tempered_mean(squared, counts, bundle, self.power)
         if self.power == 1:
             return position_error(predicted, target, window.mask, grid)
-        return tempered_error(position_errors(predicted, target, window.mask, grid, frames), window.mask, self.power)
+        return tempered_error(position_errors(predicted, target, window.mask, grid, bundle), window.mask, self.power)
 
-    def of_fields(
-        self, predicted: Mapping[str, Tensor], window: Window, spread: Mapping[str, Tensor], frames: int
-    ) -> Tensor:
-        """`field_error` of predicted fields, with this power."""
-        return field_error(predicted, field_targets(predicted, window), window, spread, frames, self.power)
+    def _particle_error(self, window: Window, grid: Grid, bundle: int, one: Tensor, other: Tensor) -> Tensor:
+        """The mean () over particles and frames of the power of their position errors."""
+        counts = counted(window, one.shape[1], bundle).view(len(one), -1, one.shape[2]).expand(one.shape[:3])
+        squared = grid.to_cell_displacement(one - other, one.dtype).square().mean(-1)
+        return (tempered(squared, self.power) * counts).sum() / counts.sum().clamp(min=1)
+
+
+def fair_score(members: Sequence[T], truth: T, distance: Callable[[T, T], Tensor]) -> Tensor:
+    """The mean distance of members to the truth, less half of that between two of them where there are several."""
+    if len(members) == 1:
+        return distance(members[0], truth)
+    skill = torch.stack([distance(member, truth) for member in members]).mean(0)
+    spread = torch.stack([distance(one, other) for one, other in combinations(members, 2)]).mean(0)
+    return skill - spread / 2
 
 
 def counted(window: Window, frames: int, bundle: int) -> Tensor:
@@ -123,12 +192,6 @@ def _tempered_mean(values: Tensor, counts: Tensor, frames: int, power: float) ->
     return mean
 
 
-def field_targets(predicted: Mapping[str, Tensor], window: Window) -> dict[str, Tensor]:
-    """The window's values (B, K m, N) of predicted fields; those that it lacks are left out."""
-    names = [name for name in predicted if name in window.fields]
-    return {name: window.field_target(name)[:, : predicted[name].shape[1]] for name in names}
-
-
 def field_error(
     predicted: Mapping[str, Tensor],
     target: Mapping[str, Tensor],
@@ -145,7 +208,7 @@ def field_error(
         window: Says which particles count.
         spread: () of each field in the training data.
         frames: m.
-        power: As of `TrainingError`.
+        power: As of `PositionLoss`.
     """
     total = torch.zeros((), device=window.mask.device)
     for name, values in target.items():
@@ -235,6 +298,16 @@ def density_error(
     fraction = scene.particle_volume / grid.cell_volume
     error: Tensor = (predicted_fraction - true_fraction).square().sum() / (2 * fraction * total.clamp(min=1e-30))
     return error
+
+
+def density_score(
+    members: Sequence[Tensor], target: Tensor, window: Window, scene: Scene, grid: Grid, there: Tensor | None
+) -> Tensor:
+    """The fair CRPS () of cells' volume fractions, over twice their sum; arguments as of `density_error`."""
+    ours = [volume_fractions(member, window, scene, grid, there) for member in members]
+    theirs = volume_fractions(target, window, scene, grid, there)
+    score = fair_score(ours, theirs, lambda one, other: (one - other).abs().sum())
+    return score / (2 * theirs.sum().clamp(min=torch.finfo(theirs.dtype).tiny))
 
 
 def volume_fractions(position: Tensor, window: Window, scene: Scene, grid: Grid, there: Tensor | None = None) -> Tensor:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from itertools import islice
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -18,7 +18,8 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor
 
 from nmpm._support.collectives import global_mean
-from nmpm._support.plain_data import class_path
+from nmpm._support.former import LOSS_OPTIONS
+from nmpm._support.plain_data import class_path, from_spec, to_spec
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.emulator import Emulator, EmulatorRecipe
 from nmpm.emulator.adaptation import adapted, with_members
@@ -37,12 +38,13 @@ from nmpm.training.augmentation import check_jitter, check_mirrors, mirror_half,
 from nmpm.training.backpropagation import CastNetworks, direct, error_of_rows, mean_over_parts, predict_window
 from nmpm.training.budget import Clock, check_end, total_steps
 from nmpm.training.evaluation import EvaluatedModule, check_window
-from nmpm.training.losses import counted
+from nmpm.training.losses import Loss, PositionLoss, counted
 from nmpm.training.optimization import OptimizerCallable, Schedule, adam, build_optimizer, with_learning_rate
 from nmpm.training.recorded_steps import MULTIPLE, RecordedSteps, can_record
-from nmpm.training.scores import repeated, training_error
 
 CALIBRATION_BATCHES = 4
+
+B = TypeVar("B", Particles, Window)
 
 
 class EmulatorModule(EvaluatedModule):
@@ -56,15 +58,10 @@ class EmulatorModule(EvaluatedModule):
             backpropagation through time, much of them is noise; at 0, trainings diverge.
         optimizer: Makes the optimizer from the parameters.
         schedule: Factor on the learning rate over the training.
-        density_weight: Weight of the density error at each bundle's last frame, beside the position error; 0 for none.
-        field_weight: Weight of the error of evolving fields, such as a temperature, in units of their spread.
-        error_power: Power, in (0, 1], to which the position error, in cells², of each window and bundle is raised
-            before the mean, as are those of fields. At 0.5, calm windows and early bundles weigh as much as splashes;
-            at 1, mean squares.
-        position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
+        loss: What training reduces, see `nmpm.training.losses`.
         members: M. From 2 on, a processor that reads noise (`nmpm.processors.Stochastic`) predicts each window M times,
-            and is trained by a score that teaches it how uncertain it is, see `nmpm.training.scores`; `error_power`
-            must be below 1.
+            and the loss scores the members together, which teaches it how uncertain it is.
+        position_noise: Standard deviation of the noise on a training window's initial positions, in domain lengths.
         mirror: Axes along which half of the training windows are mirrored; those without gravity.
         jitter: Cells, up to half of one, by which the grid is moved at most in each training step, within the scene's
             wall layer: where cells lie is chance, on which little should depend.
@@ -85,9 +82,7 @@ class EmulatorModule(EvaluatedModule):
         gradient_discount: float = 0.5,
         optimizer: OptimizerCallable = adam,
         schedule: Schedule = Schedule(),  # noqa: B008 (frozen)
-        density_weight: float = 4.0,
-        field_weight: float = 1.0,
-        error_power: float = 0.5,
+        loss: Loss = PositionLoss(),  # noqa: B008
         members: int = 1,
         position_noise: float = 0.0,
         mirror: Sequence[int] = (),
@@ -99,6 +94,7 @@ class EmulatorModule(EvaluatedModule):
         seed: int = 0,
         **recipe: Any,
     ) -> None:
+        former = {name: recipe.pop(old) for old, name in LOSS_OPTIONS.items() if old in recipe}
         emulator = with_members(EmulatorRecipe(scene, **recipe), members).build()
         super().__init__(emulator, emulator.frames * unroll, metrics)
         for name, share in (("unroll_growth", unroll_growth), ("gradient_discount", gradient_discount)):
@@ -107,8 +103,10 @@ class EmulatorModule(EvaluatedModule):
         self.unroll, self.unroll_growth, self.gradient_discount = unroll, unroll_growth, gradient_discount
         self.make_optimizer = optimizer
         self.schedule = schedule if isinstance(schedule, Schedule) else Schedule(**schedule)
-        self.error, self.members = training_error(members, density_weight, error_power), members
-        self.field_weight = field_weight
+        self.loss, self.members = from_spec(loss, Loss), members
+        if former:
+            self.loss = dataclasses.replace(self.loss, **former)
+        self.loss.check_members(members)
         self.mirror, self.jitter, self.position_noise = tuple(mirror), jitter, position_noise
         check_mirrors(emulator.scene, self.mirror)
         check_jitter(emulator.scene, emulator.grid, jitter)
@@ -117,8 +115,7 @@ class EmulatorModule(EvaluatedModule):
         self.seed = seed
         arguments = emulator.recipe.to_dict() | {
             "unroll": unroll, "unroll_growth": unroll_growth, "gradient_discount": gradient_discount,
-            "schedule": dataclasses.asdict(self.schedule), "density_weight": density_weight,
-            "field_weight": field_weight, "error_power": error_power, "members": members,
+            "schedule": dataclasses.asdict(self.schedule), "loss": to_spec(self.loss), "members": members,
             "position_noise": position_noise, "mirror": list(mirror), "jitter": jitter, "recompute": recompute,
             "compile": compile, "record": record, "seed": seed,
         }  # fmt: skip
@@ -259,11 +256,7 @@ class EmulatorModule(EvaluatedModule):
         call = recomputed if self.recompute else direct
         predicted = predict_window(emulator, start, members, count, call, self.gradient_discount, noise)
         with torch.autocast(predicted.position.device.type, enabled=False):
-            error = self.error(predicted.position, window, emulator.scene, emulator.grid, emulator.frames)
-            if not (predicted.fields and self.field_weight):
-                return error
-            of_fields = self.error.of_fields(predicted.fields, window, emulator.field_scales.spread, emulator.frames)
-            return error + self.field_weight * of_fields
+            return self.loss(predicted, window, emulator)
 
     def configure_optimizers(self) -> OptimizerLRSchedulerConfig:
         """The optimizer and its schedule. A new emulator is calibrated first, as finders step before `on_fit_start`."""
@@ -298,3 +291,10 @@ class EmulatorModule(EvaluatedModule):
         if not self.unroll_growth:
             return 1.0
         return max(self.global_step / total_steps(self.trainer), self._clock.share(self.trainer, self.global_step))
+
+
+def repeated(batch: B, members: int) -> B:
+    """Each scene of a batch so many times, one after the other."""
+    if members == 1:
+        return batch
+    return batch.scenes([scene for scene in range(len(batch.mask)) for _ in range(members)])

@@ -16,12 +16,10 @@ import pytest
 from nmpm import EmulatorModule
 from nmpm._support.shipped import user_home
 from nmpm.cli import COMMANDS, expand_home, main
-from nmpm.cli.measure import GROUP_NAMES
 from nmpm.cli.options import RUNTIMES
 from nmpm.cli.training import OPTIONS_FILE, forget_unused_slurm
 from nmpm.emulator import runtimes
 from nmpm.errors import ConfigError, DataError
-from nmpm.evaluation.stress import GROUPS
 from nmpm.training.checkpoints import AtomicCheckpointIO
 from nmpm.training.preflight import check_disk
 from tests.scenes import box
@@ -259,7 +257,6 @@ def test_a_command_imports_what_it_needs(words, unwanted):
 
 
 def test_names_that_commands_have_without_torch_are_those_that_there_are():
-    assert tuple(GROUPS) == GROUP_NAMES
     assert set(RUNTIMES) == {"auto", *runtimes.RUNTIMES}
 
 

@@ -4,7 +4,7 @@ from importlib.util import find_spec
 import pytest
 
 from nmpm.cli import main
-from nmpm.evaluation.stress import TestResult
+from nmpm.evaluation.stress.results import TestResult
 
 
 def test_one_group_of_a_zoo_model_as_json(capsys, tmp_path):
@@ -42,6 +42,6 @@ def test_by_another_runtime(capsys):
 
 def test_a_failing_line_is_an_exit_status(monkeypatch, capsys):
     failed = [TestResult("long", "one", False, {}, "nothing")]
-    monkeypatch.setattr("nmpm.evaluation.stress.battery", lambda *_: failed)
+    monkeypatch.setattr("nmpm.evaluation.stress.model.battery", lambda *_: failed)
     assert main(["stress", "goop", "--groups", "long"]) == 1
     assert "0 passed, 1 failed: one." in capsys.readouterr().out

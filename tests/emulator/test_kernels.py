@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip, Residual
 from nmpm.emulator.engines import find_engine
 from nmpm.emulator.engines.numba.engine import NumbaEngine
-from nmpm.emulator.rollouts import rollout
+from nmpm.emulator.rollouts import Rollout, rollout
 from nmpm.particles import lattice
-from nmpm.training.losses import TrainingError
+from nmpm.training.losses import PositionLoss
 from nmpm.transfer import Linear, Nearest, Quadratic, without_kernels
 from nmpm.zoo import Zoo
 from tests.scenes import box, cloud, emulator_of, padded, window_of, with_obstacle
@@ -366,7 +366,7 @@ def train_once(emulator, particles):
     predicted = torch.cat(paths, dim=1)
     shift = 0.01 * torch.arange(-1, predicted.shape[1] + 1).clamp(min=0).view(1, -1, 1, 1)
     window = window_of(dataclasses.replace(particles, fields={}), particles.position.unsqueeze(1) + shift)
-    loss = TrainingError(4.0, 0.5)(predicted, window, emulator.scene, emulator.grid, emulator.frames)
+    loss = PositionLoss(0.5, 4.0)(Rollout(predicted, {}), window, emulator)
     real = particles.mask.unsqueeze(1)
     loss = loss + sum((values * real).square().mean() for values in bundle.fields.values())
     leaves = [position, velocity, *(values for values in fields.values() if values.requires_grad)]

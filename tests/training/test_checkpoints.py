@@ -14,6 +14,7 @@ from nmpm.optimizers import SOAP
 from nmpm.processors import Identity
 from nmpm.training import EmulatorModule
 from nmpm.training.checkpoints import load_module
+from nmpm.training.losses import PositionLoss
 from nmpm.transfer import Nearest
 from tests.conftest import make_dataset
 from tests.trainings import TINY, data_of, module_of, trainer_of
@@ -66,7 +67,12 @@ def test_a_checkpoint_is_not_tested_with_another_part_or_on_other_scenes(begun, 
 
 def test_a_training_goes_on_with_the_arguments_that_it_is_given(begun, tmp_path, caplog):
     slower = functools.partial(torch.optim.Adam, lr=1e-5, betas=(0.5, 0.9))
-    changes = {"density_weight": 0.5, "schedule": {"warmup": 1}, "unroll": 1, "constraints": {"rest_speed": 0.1}}
+    changes = {
+        "loss": PositionLoss(density_weight=0.5),
+        "schedule": {"warmup": 1},
+        "unroll": 1,
+        "constraints": {"rest_speed": 0.1},
+    }
     rate = torch.load(begun, weights_only=True)["optimizer_states"][0]["param_groups"][0]["initial_lr"]
     with caplog.at_level("INFO", "lightning.pytorch"):
         go_on(begun, tmp_path / "unchanged")
@@ -77,7 +83,7 @@ def test_a_training_goes_on_with_the_arguments_that_it_is_given(begun, tmp_path,
     for change in (
         f"model.optimizer.lr = 1e-05 (was {rate})",
         "betas = (0.5, 0.9) (was (0.9, 0.999))",
-        "density_weight = 0.5 (was 4.0)",
+        "model.loss.density_weight = 0.5 (was 4.0)",
         "schedule.warmup = 1 (was",
         "constraints.rest_speed = 0.1 (was",
     ):

@@ -20,6 +20,7 @@ from nmpm.metrics import MSE
 from nmpm.optimizers import SOAP
 from nmpm.processors import UNet
 from nmpm.training import module as training_module
+from nmpm.training.losses import PositionLoss
 from nmpm.training.optimization import Schedule
 from nmpm.transfer import Nearest
 from tests.trainings import QUIET, TINY
@@ -31,9 +32,7 @@ CHANGED_MODEL: dict[str, Any] = {
     "gradient_discount": 1.0,
     "optimizer": SOAP,
     "schedule": Schedule(warmup=1, start=0.5),
-    "density_weight": 0.0,
-    "field_weight": 0.0,
-    "error_power": 1.0,
+    "loss": PositionLoss(power=1.0),
     "members": 2,
     "position_noise": 1e-3,
     "mirror": (0,),
@@ -51,6 +50,7 @@ CHANGED_MODEL: dict[str, Any] = {
     "grid_noise": 0.1,
     "constraints": Constraints(rest_speed=5.0),
 }
+CHANGED_LOSS = {"power": 1.0, "density_weight": 0.0, "field_weight": 0.0}
 CHANGED_CONSTRAINTS = {"energy": True, "rest_speed": 0.1, "solids": False, "bounds": "reflect", "density_cap": 0.2}
 DATA = {"horizon": 4, "batch_size": 2, "buffer_size": 2, "passes": 1.0}
 CHANGED_DATA: dict[str, Any] = {

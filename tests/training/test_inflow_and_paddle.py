@@ -10,15 +10,15 @@ from torch.optim import Adam
 
 from nmpm.cli import main
 from nmpm.data.format import Split, Trajectory, write_metadata, write_split
-from nmpm.emulator import Prescribed, RolloutOptions, rollout
+from nmpm.emulator import Prescribed, Rollout, RolloutOptions, rollout
 from nmpm.emulator.calibration import calibrate
 from nmpm.grid import Grid
 from nmpm.particles import Window
 from nmpm.processors import UNet
-from nmpm.training.losses import TrainingError, counted, density_error, position_error, tempered_error
+from nmpm.training.losses import PositionLoss, counted, density_error, position_error, tempered_error
 from nmpm.training.optimization import Schedule
 from tests.made_up import made_up_metadata
-from tests.scenes import box, cloud
+from tests.scenes import box, cloud, emulator_of
 from tests.trainings import data_of, module_of, trainer_of
 
 FRAMES = 30
@@ -159,8 +159,8 @@ def with_presence(window: Window, frames: int) -> Window:
 
 
 def test_losses_are_those_of_the_particles_there_alone():
-    scene, grid = box(materials=("water", "sand")), Grid.of(box(), 42)
-    state = cloud(scene, 10, batch=2)
+    scene = box(materials=("water", "sand"))
+    emulator, state = emulator_of(scene, 42), cloud(scene, 10, batch=2)
     frames = state.position.unsqueeze(1) + 0.01 * torch.rand(2, 10, 10, 2)
     window = dataclasses.replace(Window.of(state), frames=frames)
     few = Window(frames[:, :, :5], *(v[:, :5] for v in (state.material, state.mask)), *(
@@ -169,14 +169,15 @@ def test_losses_are_those_of_the_particles_there_alone():
     predicted = (window.target + 0.02 * torch.randn(2, 8, 10, 2)).requires_grad_()
     alone = predicted.detach()[:, :, :5].clone().requires_grad_()
     for power, weight in ((1.0, 0.0), (0.5, 4.0)):
-        error = TrainingError(weight, power)
-        here, there = error(predicted, with_presence(window, 10), scene, grid, 4), error(alone, few, scene, grid, 4)
+        loss = PositionLoss(power, weight)
+        here = loss(Rollout(predicted, {}), with_presence(window, 10), emulator)
+        there = loss(Rollout(alone, {}), few, emulator)
         torch.testing.assert_close(here, there)
         (one,), (other,) = torch.autograd.grad(here, [predicted]), torch.autograd.grad(there, [alone])
         torch.testing.assert_close(one[:, :, :5], other)
         assert not one[:, :, 5:].any()
     nobody = dataclasses.replace(window, present=torch.zeros(2, 10, 10, dtype=torch.bool))
-    assert TrainingError(4.0, 0.5)(predicted, nobody, scene, grid, 4).item() == 0
+    assert PositionLoss()(Rollout(predicted, {}), nobody, emulator).item() == 0
     assert counted(nobody, 8, 4).sum() == 0
 
 

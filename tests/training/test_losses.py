@@ -3,11 +3,26 @@ import dataclasses
 import pytest
 import torch
 
+from nmpm.emulator import Rollout
 from nmpm.errors import ConfigError
 from nmpm.grid import Grid
 from nmpm.particles import Window
-from nmpm.training.losses import TrainingError, density_error, position_error, position_errors
-from tests.scenes import box, cloud, padded, window_of
+from nmpm.testing import LossContract
+from nmpm.training.losses import PositionLoss, density_error, position_error, position_errors
+from tests.scenes import box, cloud, emulator_of, padded, window_of
+
+
+@pytest.mark.parametrize("loss", [PositionLoss(), PositionLoss(1.0, 0.0), PositionLoss(0.3, 0.0, 0.0)], ids=str)
+class TestPositionLoss(LossContract):
+    @pytest.fixture(autouse=True)
+    def choose(self, loss):
+        self.loss = loss
+
+
+def loss_of(predicted, window, frames, power=0.5, density_weight=0.0):
+    """The loss of positions in a box of 42 cells, in bundles of so many frames."""
+    loss = PositionLoss(power, density_weight)
+    return loss(Rollout(predicted, {}), window, emulator_of(box(), 42, frames))
 
 
 def at(*places: tuple[float, float], materials=("goop",), material=0):
@@ -73,10 +88,10 @@ def test_errors_of_windows_and_bundles_average_to_those_of_all():
 
 @pytest.mark.parametrize("power", [1.0, 0.5])
 def test_at_power_one_half_a_calm_window_weighs_as_much_as_a_violent_one(power):
-    scene, grid, window, predicted = calm_and_violent()
+    _, _, window, predicted = calm_and_violent()
     scale = torch.ones(2, requires_grad=True)
     moved = window.target + scale[:, None, None, None] * (predicted - window.target)
-    (share,) = torch.autograd.grad(TrainingError(power=power)(moved, window, scene, grid, 2), scale)
+    (share,) = torch.autograd.grad(loss_of(moved, window, 2, power), scale)
     # d/ds of (s² e)^p is 2 p e^p at s = 1.
     torch.testing.assert_close(share, power * torch.tensor([0.005, 50.0]) ** power, rtol=2e-2, atol=0)
 
@@ -85,14 +100,14 @@ def test_the_density_error_is_added_as_it_is():
     scene, grid, window, predicted = calm_and_violent()
     last = slice(1, None, 2)
     density = density_error(predicted[:, last], window.target[:, last], window, scene, grid)
-    alone, both = (TrainingError(weight, 0.5)(predicted, window, scene, grid, 2) for weight in (0.0, 3.0))
+    alone, both = (loss_of(predicted, window, 2, 0.5, weight) for weight in (0.0, 3.0))
     torch.testing.assert_close(both, alone + 3 * density)
 
 
 def test_perfect_predictions_have_finite_gradients_at_any_power():
-    scene, grid, window, _ = calm_and_violent()
+    window = calm_and_violent()[2]
     moved = window.target.clone().requires_grad_()
-    TrainingError(density_weight=1.0, power=0.1)(moved, window, scene, grid, 4).backward()
+    loss_of(moved, window, 4, 0.1, 1.0).backward()
     assert moved.grad.isfinite().all()
 
 
@@ -102,23 +117,29 @@ def test_padding_changes_no_error_of_positions_and_densities():
     for each, shift in ((state, [0.3, 0.3]), (padded(state, torch.tensor([[0.6, 0.6]])), [0.3, 0.3, 5.0])):
         window = window_of(each, each.position.unsqueeze(1).expand(-1, 3, -1, -1))
         predicted = window.target + torch.tensor(shift)[:, None] * grid.spacing[0]
-        errors.append(TrainingError(1.0, 0.5)(predicted, window, scene, grid, 1))
+        errors.append(loss_of(predicted, window, 1, density_weight=1.0))
     torch.testing.assert_close(*errors)
 
 
 def test_frames_that_do_not_match_are_refused_and_longer_windows_cut():
-    scene, grid, window, predicted = calm_and_violent(frames=4)
-    error = TrainingError(1.0, 0.5)
-    with pytest.raises(ValueError, match=r"Predicted \(2, 8, 1, 2\) and target \(2, 4, 1, 2\) positions do not match"):
-        error(torch.cat([predicted, predicted], 1), window, scene, grid, 4)
-    with pytest.raises(ValueError, match="4 predicted frames are no whole number of bundles of 3"):
-        error(predicted, window, scene, grid, 3)
-    with pytest.raises(ValueError, match="do not match"):
-        error(predicted, window.first(3), scene, grid, 2)  # whose single frame would broadcast
+    _, _, window, predicted = calm_and_violent(frames=4)
+    for wrong, cut, frames, complaint in (
+        (torch.cat([predicted, predicted], 1), window, 4, r"Predicted \(2, 8, 1, 2\) and target \(2, 4, 1, 2\)"),
+        (predicted, window, 3, "4 predicted frames are no whole number of bundles of 3"),
+        (predicted, window.first(3), 2, "do not match"),  # whose single frame would broadcast
+    ):
+        with pytest.raises(ValueError, match=complaint):
+            loss_of(wrong, cut, frames)
     short = predicted[:, :2]
-    assert torch.equal(error(short, window, scene, grid, 2), error(short, window.first(4), scene, grid, 2))
-    with pytest.raises(ConfigError, match=r"error_power = .* above 0 and at most 1"):
-        TrainingError(power=1.5)
+    assert torch.equal(loss_of(short, window, 2), loss_of(short, window.first(4), 2))
+
+
+@pytest.mark.parametrize(("power", "members", "complaint"), [
+    (1.5, 1, r"loss\.power = .* above 0 and at most 1"), (1.0, 2, r"loss\.power = 1"), (0.5, 0, "members = 0"),
+])  # fmt: skip
+def test_what_no_loss_can_score_is_refused(power, members, complaint):
+    with pytest.raises(ConfigError, match=complaint):
+        PositionLoss(power).check_members(members)
 
 
 def test_the_error_of_fields_is_the_mean_square_in_units_of_the_spread():
@@ -126,8 +147,9 @@ def test_the_error_of_fields_is_the_mean_square_in_units_of_the_spread():
     state.mask[1, 1:] = False
     window = window_of(state, state.position.unsqueeze(1).expand(-1, 6, -1, -1))
     window.fields = {"heat": torch.zeros(2, 6, 3)}
-    predicted = torch.full((2, 4, 3), 0.2)
-    predicted[1, :, 1:] = 1e6
-    spread = {"heat": torch.tensor(0.1)}
-    error = TrainingError(0.0, 0.5).of_fields({"heat": predicted, "other": predicted}, window, spread, frames=2)
-    assert float(error) == pytest.approx((4 + 1e-4) ** 0.5)
+    heat = torch.full((2, 4, 3), 0.2)
+    heat[1, :, 1:] = 1e6
+    emulator = emulator_of(box(evolving=("heat",)), 42, 2)
+    emulator.field_scales.std.fill_(0.1)
+    error = PositionLoss(0.5, 0.0)(Rollout(window.target, {"heat": heat, "other": heat}), window, emulator)
+    assert float(error) == pytest.approx((4 + 1e-4) ** 0.5 + 1e-2)  # that of perfect positions is the floor's root

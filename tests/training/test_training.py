@@ -19,6 +19,7 @@ from nmpm.optimizers import SOAP
 from nmpm.training import EmulatorModule
 from nmpm.training.callbacks.outputs import ReportWriter
 from nmpm.training.checkpoints import load_module
+from nmpm.training.losses import PositionLoss
 from nmpm.training.optimization import Schedule
 from nmpm.transfer import Nearest, without_kernels
 from tests.trainings import TINY, Record, data_of, module_of, trainer_of
@@ -32,7 +33,7 @@ def assert_same_weights(one: EmulatorModule, other: EmulatorModule) -> None:
 def test_training_lowers_the_loss_and_reports_rollouts_beside_the_trivial_predictors(make_dataset, tmp_path):
     data, record = data_of(make_dataset()), Record()
     fast = functools.partial(torch.optim.Adam, lr=1e-2)
-    plain = {"error_power": 1.0, "density_weight": 0.0, "position_noise": 0.0, "grid_noise": 0.0}
+    plain = {"loss": PositionLoss(1.0, 0.0), "position_noise": 0.0, "grid_noise": 0.0}
     model = module_of(data, schedule=Schedule(warmup=2), optimizer=fast, **plain)
     trainer = trainer_of(tmp_path, 60, record, val_check_interval=60)
     trainer.fit(model, data)

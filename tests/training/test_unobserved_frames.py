@@ -10,16 +10,16 @@ import torch
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.format import write_metadata, write_split
 from nmpm.data.sources import FolderSource
+from nmpm.emulator import Rollout
 from nmpm.emulator.calibration import calibrate
 from nmpm.evaluation.comparison import Comparison, free_fall
 from nmpm.evaluation.prediction_errors import Measures, measure_errors
-from nmpm.grid import Grid
 from nmpm.metrics import MSE, EarthMover
 from nmpm.particles import Window
 from nmpm.scene import Reading
-from nmpm.training.losses import TrainingError, counted
+from nmpm.training.losses import PositionLoss, counted
 from tests.made_up import made_up_metadata, made_up_trajectory
-from tests.scenes import box, cloud
+from tests.scenes import box, cloud, emulator_of
 from tests.trainings import data_of, module_of, trainer_of
 
 
@@ -92,12 +92,12 @@ def test_horizons_count_the_frames_of_the_data_that_a_model_skips():
 @pytest.mark.parametrize(("power", "weight", "between"), [(1.0, 0.0, 2), (0.5, 4.0, 3), (0.5, 4.0, 8)])
 def test_errors_and_their_gradients_do_not_depend_on_frames_that_nobody_observed(power, weight, between):
     window, exact = falling(16, between)
-    grid, error = Grid.of(box(), 42), TrainingError(weight, power)
+    emulator, loss = emulator_of(box(), 42), PositionLoss(power, weight)
     other = window.frames.clone()
     other[:, 2:][:, ~window.observed[0, 2:]] = 0.5
     predicted = (exact + 0.01 * torch.randn(exact.shape)).requires_grad_()
     losses = [
-        error(predicted, dataclasses.replace(window, frames=frames), box(), grid, 4)
+        loss(Rollout(predicted, {}), dataclasses.replace(window, frames=frames), emulator)
         for frames in (window.frames, other)
     ]
     slopes = [torch.autograd.grad(loss, predicted)[0] for loss in losses]
@@ -105,21 +105,21 @@ def test_errors_and_their_gradients_do_not_depend_on_frames_that_nobody_observed
     assert torch.equal(*slopes)
     assert torch.equal(slopes[0].abs().sum((0, 2, 3)) > 0, window.observed[0, 2:])
     wrong = torch.where(window.observed[:, 2:, None, None], exact, 0.5)
-    perfect = TrainingError(weight, 1.0)
-    assert perfect(wrong, window, box(), grid, 4) == 0  # also in bundles without an observed frame
     heat = torch.where(window.observed[:, 2:, None], 1.0, 7.0).expand(2, 16, 6)
-    assert TrainingError().of_fields({"heat": heat}, window, {"heat": torch.tensor(1.0)}, 4) == 0
+    warm = emulator_of(box(evolving=("heat",)), 42)
+    perfect = PositionLoss(1.0, weight)(Rollout(wrong, {"heat": heat}), window, warm)
+    assert perfect == 0  # also in bundles without an observed frame
 
 
 def test_frames_that_were_all_observed_have_the_errors_of_plain_ones():
     window, exact = falling(8, 1)
-    predicted, grid = exact + 0.01 * torch.randn(exact.shape), Grid.of(box(), 42)
+    predicted, emulator = Rollout(exact + 0.01 * torch.randn(exact.shape), {}), emulator_of(box(), 42)
     plain = dataclasses.replace(window, observed=None)
-    for error in (TrainingError(), TrainingError(4.0, 0.5)):
-        one, other = (error(predicted, each, box(), grid, 4) for each in (window, plain))
+    for loss in (PositionLoss(1.0, 0.0), PositionLoss()):
+        one, other = (loss(predicted, each, emulator) for each in (window, plain))
         torch.testing.assert_close(one, other)
     unseen = dataclasses.replace(window, observed=window.observed & False)
-    assert TrainingError(4.0, 0.5)(predicted, unseen, box(), grid, 4) == 0
+    assert PositionLoss()(predicted, unseen, emulator) == 0
     assert counted(unseen, 8, 4).sum() == 0
 
 
@@ -127,7 +127,7 @@ def test_frames_that_were_all_observed_have_the_errors_of_plain_ones():
 def test_a_training_step_does_not_depend_on_frames_that_nobody_observed(folder, between):
     data = read_with(folder, between=between)
     window = next(iter(data.train_dataloader()))
-    module = module_of(data, density_weight=4.0, position_noise=0.0, grid_noise=0.0)
+    module = module_of(data, position_noise=0.0, grid_noise=0.0)
     calibrate(module.emulator, [window])
     module.log = lambda *_: None
     other = window.frames.clone()

@@ -13,7 +13,8 @@ from nmpm.cli import main
 from nmpm.emulator import members
 from nmpm.emulator.digests import weights_digest
 from nmpm.errors import ConfigError, UnstableError, ZooError
-from nmpm.evaluation.stress import QUICK, results
+from nmpm.evaluation.stress import GROUPS, results
+from nmpm.evaluation.stress.results import QUICK
 from nmpm.evaluation.trade.ranking import Setting, at_equal_error
 from nmpm.sim import load_preset
 from nmpm.sim.preset import nudge, twin_of
@@ -148,7 +149,8 @@ def test_stress_tests_are_counted_and_settling_is_simulated_once(entry, monkeypa
         yield results.TestResult("settling", "with constraints", True, {}, "")
         yield results.TestResult("settling", "without constraints", False, {}, "")
 
-    monkeypatch.setattr("nmpm.zoo.measures.model.GROUPS", {"long": long, "settling": settle})
+    monkeypatch.setattr(GROUPS, "built_in", {"long": long, "settling": settle})
+    monkeypatch.setattr(GROUPS, "_loaded", {})
     refresh(entry, [measure])
     card = Zoo.card("small", entry.parent)
     assert len(settled) == 1

@@ -1,9 +1,9 @@
-"""The model under test, and the simulator of its scenes where there is one."""
+"""The model under test, the simulator of its scenes where there is one, and the tests' run."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -16,6 +16,8 @@ from nmpm.data.windows import Recording, collate
 from nmpm.emulator import Emulator
 from nmpm.emulator.calibration import with_usual_gravity
 from nmpm.emulator.similarity import Match
+from nmpm.evaluation.stress import GROUPS
+from nmpm.evaluation.stress.results import Effort, TestResult
 from nmpm.particles import Particles, Window, thrown_blocks
 from nmpm.scene import Reading
 from nmpm.sim import Preset
@@ -90,6 +92,13 @@ class ModelUnderTest:
     def with_emulator(self, emulator: Emulator) -> ModelUnderTest:
         """The same test of another emulator."""
         return replace(self, emulator=emulator)
+
+
+def battery(model: ModelUnderTest, effort: Effort, groups: Iterable[str] = GROUPS) -> Iterator[TestResult]:
+    """Run groups of tests, by name, on a model; yield each result as soon as it is known."""
+    with torch.no_grad():
+        for name in groups:
+            yield from GROUPS[name](model, effort)
 
 
 def simulate_window(model: ModelUnderTest, preset: Preset, count: int, frames: int) -> Window:

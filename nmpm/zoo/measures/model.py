@@ -17,7 +17,9 @@ from nmpm.emulator.trust import Trust, TrustTracker
 from nmpm.evaluation.bootstrap import interval
 from nmpm.evaluation.pictures import labelled_trajectories
 from nmpm.evaluation.prediction_errors import Measures, measure_errors
-from nmpm.evaluation.stress import GROUPS, QUICK, ModelUnderTest, TestResult, battery
+from nmpm.evaluation.stress import GROUPS
+from nmpm.evaluation.stress.model import ModelUnderTest, battery
+from nmpm.evaluation.stress.results import QUICK, TestResult
 from nmpm.particles import Window
 from nmpm.viz import write_snapshots
 from nmpm.zoo.card import stress_digest
@@ -100,11 +102,11 @@ def _stress(model: ModelUnderTest, size: str) -> dict[str, Any]:
     free = model.with_emulator(model.emulator.unconstrained())
     results: list[TestResult] = []
     free_results: list[TestResult] = []
-    with progress_bar(f"stress of {model.name}", len(GROUPS)) as advance:
-        for name, group in GROUPS.items():
-            results += battery(model, QUICK, {name: group})
+    with progress_bar(f"stress of {model.name}", len(GROUPS.built_in)) as advance:
+        for name in GROUPS.built_in:
+            results += battery(model, QUICK, [name])
             # The last result of settling is without constraints; simulating it again would take most of the time.
-            free_results += results[-1:] if name == _SETTLING else battery(free, QUICK, {name: group})
+            free_results += results[-1:] if name == _SETTLING else battery(free, QUICK, [name])
             advance()
     return {
         "stress": stress_digest(size, map(vars, results)),

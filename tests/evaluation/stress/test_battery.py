@@ -14,8 +14,9 @@ from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.monitor import beyond_walls
 from nmpm.emulator.similarity import find_match
 from nmpm.errors import UnstableError
-from nmpm.evaluation.stress import GROUPS, Effort, ModelUnderTest, battery, results
-from nmpm.evaluation.stress.model import simulate_beside, simulate_window
+from nmpm.evaluation.stress import GROUPS, results
+from nmpm.evaluation.stress.model import ModelUnderTest, battery, simulate_beside, simulate_window
+from nmpm.evaluation.stress.results import Effort
 from nmpm.evaluation.stress.trace import energy_above_lowest, filled_volume, is_lost, rms_distance, trace_bundles
 from nmpm.particles import lattice, state_at_rest
 from nmpm.processors import Pointwise
@@ -59,8 +60,7 @@ def test_a_model_is_tested_on_scenes_of_another_kind():
     assert window.target.shape[1] == 5
     assert window.initial.material.max() == 0  # goop to the model
     assert set(window.initial.obstacle.shape[1:]) != {0}
-    groups = {name: GROUPS[name] for name in ("speeds", "sizes", "settling")}
-    results = {result.name: result for result in battery(other, TINY, groups)}
+    results = {result.name: result for result in battery(other, TINY, ("speeds", "sizes", "settling"))}
     for name in ("initial speed × 1", "gravity × 2", "domain 2 × as wide", "grid refined"):
         assert 0 < results[name].figures["mse"] < 10 * results[name].figures["mse_nothing_moves"], name
     assert model.over(model.preset, find_match(model.emulator, model.preset.scene)).reading is None
@@ -73,7 +73,7 @@ def recorded() -> ModelUnderTest:
 @pytest.mark.parametrize("group", GROUPS)
 @pytest.mark.parametrize("model", [goop(), recorded()], ids=["simulated", "recorded"])
 def test_every_group_says_what_it_measured(group, model):
-    tested = list(battery(model, TINY, {group: GROUPS[group]}))
+    tested = list(battery(model, TINY, [group]))
     assert tested
     names = [result.name for result in tested]
     assert len(set(names)) == len(names)
@@ -89,30 +89,30 @@ def test_every_group_says_what_it_measured(group, model):
 
 def test_shapes_stand_beside_the_simulators_and_its_twins():
     model = goop()
-    held, free = battery(model, TINY, {"settling": GROUPS["settling"]})
+    held, free = battery(model, TINY, ["settling"])
     for result in (held, free):
         twin = {name: value for name, value in result.figures.items() if name.startswith("twin_")}
         assert set(twin) == {f"twin_{name}" for name in result.figures if not name.startswith("twin_")}
         assert {name.rsplit("_", 1)[1] for name in twin} == {"10", "20"}
         assert 0.9 < twin["twin_height_at_20"] < 1.1
     bare = model.with_emulator(model.emulator.unconstrained())
-    (result,) = battery(bare, TINY, {"settling": GROUPS["settling"]})
+    (result,) = battery(bare, TINY, ["settling"])
     assert result.figures == free.figures
 
 
 def test_a_model_that_makes_energy_fails_and_constraints_do_not_hide_it():
     model = goop(scale=0.5)
     bare = model.with_emulator(model.emulator.unconstrained())
-    held, made = (list(battery(each, TINY, {"long": GROUPS["long"]})) for each in (model, bare))
+    held, made = (list(battery(each, TINY, ["long"])) for each in (model, bare))
     assert held[0].passed
     assert made[0].passed is False
     assert made[0].figures["energy_gain_percent"] > 100
     assert made[1].figures["most"] < 2 * 8 + 1  # steps to failure
-    alone = list(battery(model, TINY, {"free": GROUPS["free"]}))
+    alone = list(battery(model, TINY, ["free"]))
     assert alone[0].name == held[0].name
     assert alone[0].figures["holds"] == 0
     assert {result.passed for result in alone} == {None}
-    assert not list(battery(bare, TINY, {"free": GROUPS["free"]}))
+    assert not list(battery(bare, TINY, ["free"]))
 
 
 def test_scenes_one_by_one_are_those_of_a_window_and_unstable_ones_make_room_for_others(monkeypatch):
@@ -202,7 +202,7 @@ def test_made_up_scenes_are_not_weightless_where_gravity_varies(group, runs, mon
         return run(model, state, *rest)
 
     monkeypatch.setattr(module, name, noting)
-    assert list(battery(ModelUnderTest("turned", emulator, 8), TINY, {group: GROUPS[group]}))
+    assert list(battery(ModelUnderTest("turned", emulator, 8), TINY, [group]))
     assert pulls
     assert all((pull[:, 1] < 0).all() and (pull[:, 0] == 0).all() for pull in pulls)
 
