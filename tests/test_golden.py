@@ -10,7 +10,7 @@ import torch
 from nmpm import Particles
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.emulator.rollouts import rollout
-from nmpm.training.checkpoints import load_module
+from nmpm.training.module import load_module
 
 GOLDEN = Path(__file__).parent / "golden"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from lightning.fabric.plugins.io import TorchCheckpointIO
@@ -19,11 +19,8 @@ from nmpm._support.plain_data import class_path, to_plain
 from nmpm.emulator import EmulatorRecipe
 from nmpm.emulator.digests import weights_digest
 from nmpm.emulator.recipe import FORMAT
-from nmpm.errors import ConfigError, DataError, NmpmError
+from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
-
-if TYPE_CHECKING:
-    from nmpm.training.module import EmulatorModule
 
 COMPARED = ("cells", "frames", "transfer", "processor", "decoder")
 """Parts of a recipe that its weights were trained for; constraints and noise may change."""
@@ -76,30 +73,6 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             " or last.ckpt beside it."
         )
     return content
-
-
-def load_module(path: Path) -> EmulatorModule:
-    """Load the module of a checkpoint onto the CPU.
-
-    Raises:
-        DataError, ConfigError: if the file is not a checkpoint of an emulator, or of a newer version.
-    """
-    from nmpm.training.module import EmulatorModule  # (which imports this module)
-
-    content = read_checkpoint(path)
-    stored = content.get("hyper_parameters", {})
-    if not isinstance(stored, dict) or not isinstance(stored.get("scene", {}), dict):
-        raise DataError(f"{path} is not a checkpoint of an emulator: its hyperparameters are not named values.")
-    try:
-        module = EmulatorModule(**stored)
-        module.on_load_checkpoint(content)
-        module.load_state_dict(content["state_dict"])
-    except NmpmError:
-        raise
-    except Exception as error:  # hyperparameters of a foreign or damaged file may have any type and value
-        reason = f"{type(error).__name__}: {one_line(error)}"
-        raise DataError(f"{path} is not a checkpoint of an emulator of this version ({reason}).") from error
-    return module
 
 
 def check_horizon(frames: int, unroll: int, horizon: int) -> None:

@@ -7,11 +7,12 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from itertools import islice
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from lightning.pytorch import Callback
+from lightning.pytorch import Callback, LightningModule
 from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities import rank_zero_info
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
@@ -19,9 +20,10 @@ from torch import Tensor
 
 from nmpm._support.collectives import global_mean
 from nmpm._support.former import LOSS_OPTIONS
+from nmpm._support.messages import one_line
 from nmpm._support.plain_data import class_path, from_spec, to_spec
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.emulator import Emulator, EmulatorRecipe
+from nmpm.emulator import Emulator, EmulatorRecipe, Prescribed, Rollout, RolloutOptions, predict_rollout
 from nmpm.emulator.adaptation import adapted, with_members
 from nmpm.emulator.calibration import calibrate, calibrate_unread, unread_inputs
 from nmpm.emulator.digests import weights_digest
@@ -29,25 +31,37 @@ from nmpm.emulator.fields import warn_of_ignored
 from nmpm.emulator.noise import training_noise
 from nmpm.emulator.recipe import FORMAT, check_format
 from nmpm.emulator.rollouts import recomputed
-from nmpm.errors import ConfigError
-from nmpm.metrics import RolloutMetric
+from nmpm.errors import ConfigError, DataError, NmpmError
+from nmpm.evaluation.comparison import Comparison
+from nmpm.evaluation.ensembles import EnsembleTest
+from nmpm.metrics import MSE, RolloutMetric, overall_error
 from nmpm.particles import Particles, Window
-from nmpm.scene import Scene
+from nmpm.scene import Reading, Scene
 from nmpm.training import checkpoints, preflight
 from nmpm.training.augmentation import check_jitter, check_mirrors, mirror_half, noisy_start, with_jitter
-from nmpm.training.backpropagation import CastNetworks, direct, error_of_rows, mean_over_parts, predict_window
+from nmpm.training.backpropagation import (
+    MOST_PARTS,
+    CastNetworks,
+    direct,
+    error_of_rows,
+    mean_over_parts,
+    on_threads,
+    predict_window,
+    split_rows,
+)
 from nmpm.training.budget import Clock, check_end, total_steps
-from nmpm.training.evaluation import EvaluatedModule, check_window
 from nmpm.training.losses import Loss, PositionLoss, counted
 from nmpm.training.optimization import OptimizerCallable, Schedule, adam, build_optimizer, with_learning_rate
 from nmpm.training.recorded_steps import MULTIPLE, RecordedSteps, can_record
 
 CALIBRATION_BATCHES = 4
+VALIDATED = 4
+"""Members of each scene in validations of ensembles."""
 
 B = TypeVar("B", Particles, Window)
 
 
-class EmulatorModule(EvaluatedModule):
+class EmulatorModule(LightningModule):
     """Trains an emulator on windows; validates and tests it by full rollouts.
 
     Args:
@@ -72,7 +86,20 @@ class EmulatorModule(EvaluatedModule):
         record: Whether to record steps as CUDA graphs, which saves launches on a GPU; no effect elsewhere.
         seed: Of the noise.
         recipe: The emulator's form: the further arguments of `EmulatorRecipe`.
+
+    Attributes:
+        parts: In how many parts a batch is computed on a CPU; None for as many as torch has threads, at most 4. Other
+            numbers change results by rounding.
+        threads: How many threads compute them; None for one each. Changes no result.
+        reading: How the data are read for the emulator; errors count frames of the data.
+        tested_members: Members of which tests measure scores, too; None for none.
+        ensemble: These scores, in tests of members and in validations of ensembles.
     """
+
+    parts: int | None = None
+    threads: int | None = None
+    tested_members: int | None = None
+    ensemble: EnsembleTest | None = None
 
     def __init__(
         self,
@@ -96,7 +123,11 @@ class EmulatorModule(EvaluatedModule):
     ) -> None:
         former = {name: recipe.pop(old) for old, name in LOSS_OPTIONS.items() if old in recipe}
         emulator = with_members(EmulatorRecipe(scene, **recipe), members).build()
-        super().__init__(emulator, emulator.frames * unroll, metrics)
+        super().__init__()
+        self.emulator, self.reading = emulator, Reading(emulator.scene)
+        reported = [MSE()] if metrics is None else list(metrics)
+        self.valid_errors = Comparison(emulator.scene, [one for one in reported if one.cheap], emulator.frames)
+        self.test_errors = Comparison(emulator.scene, reported, emulator.frames)
         for name, share in (("unroll_growth", unroll_growth), ("gradient_discount", gradient_discount)):
             if not 0 <= share <= 1:
                 raise ConfigError(f"model.{name} = {share} must be in [0, 1], a share.")
@@ -162,8 +193,10 @@ class EmulatorModule(EvaluatedModule):
 
     def setup(self, stage: str) -> None:
         """Raise ConfigError if data, model or metrics do not suit each other; warn of fields that are ignored."""
-        super().setup(stage)
         data = getattr(self.trainer, "datamodule", None)
+        self.reading = getattr(data, "reading", Reading(self.emulator.scene))
+        for errors in (self.valid_errors, self.test_errors):
+            errors.count_every(self.reading.every)
         scene, horizon = getattr(data, "scene", None), getattr(data, "horizon", None)
         if isinstance(scene, Scene):
             checkpoints.check_same_scene(self.emulator.scene, scene)
@@ -291,6 +324,112 @@ class EmulatorModule(EvaluatedModule):
         if not self.unroll_growth:
             return 1.0
         return max(self.global_step / total_steps(self.trainer), self._clock.share(self.trainer, self.global_step))
+
+    def on_before_batch_transfer(self, batch: object, dataloader_idx: int) -> object:  # noqa: ARG002
+        return check_window(batch)
+
+    def validation_step(self, batch: Window, batch_idx: int) -> None:  # noqa: ARG002
+        predicted = self._predict(batch)
+        self._score_members(batch, predicted)
+        self.valid_errors.update(batch, predicted.position, predicted.fields)
+
+    def test_step(self, batch: Window, batch_idx: int) -> Tensor:  # noqa: ARG002
+        with torch.autocast(self.device.type, enabled=False):  # in the precision that trained models are used in
+            predicted = self._predict(batch)
+            self._score_members(batch, predicted)
+        self.test_errors.update(batch, predicted.position, predicted.fields)
+        return predicted.position
+
+    def _score_members(self, batch: Window, predicted: Rollout) -> None:
+        """Add the scores of members, if they are asked for, beside the one rollout."""
+        if self.ensemble is not None:
+            for row in range(len(batch.frames)):
+                self.ensemble.update(batch.scenes([row]), predicted.position[[row]])
+
+    def predict_step(self, batch: Window, batch_idx: int) -> Tensor | Rollout:  # noqa: ARG002
+        """(B, T - 2, N, D) predicted positions; with the fields where the scene has any that evolve."""
+        predicted = self._predict(batch)
+        return predicted if predicted.fields else predicted.position
+
+    def _predict(self, batch: Window) -> Rollout:
+        start, frames, rows = batch.initial, batch.target.shape[1], self.rows(batch)
+        prescribed = Prescribed.of(batch)
+        if len(rows) == 1:
+            return predict_rollout(self.emulator, start, frames, RolloutOptions(prescribed))
+
+        def predict(part: slice) -> Rollout:
+            given = prescribed and prescribed.scenes(part)
+            return predict_rollout(self.emulator, start.scenes(part), frames, RolloutOptions(given))
+
+        return Rollout.stack(on_threads(predict, rows, self.threads or len(rows)))
+
+    def rows(self, batch: Window) -> list[slice]:
+        """The rows of the parts of a batch that a thread each computes, on a CPU.
+
+        All in one where torch compiles for a shape, or noise is drawn for all windows together.
+        """
+        compiled = self.compiled or self.emulator.shapes_are_compiled
+        whole = self.device.type != "cpu" or compiled or self.emulator.recipe.grid_noise > 0
+        return split_rows(len(batch.frames), 1 if whole else self.parts or min(torch.get_num_threads(), MOST_PARTS))
+
+    def on_validation_epoch_start(self) -> None:
+        self.valid_errors.reset()
+        self._start_ensemble(VALIDATED if self.members > 1 else None)
+
+    def on_test_epoch_start(self) -> None:
+        self.test_errors.reset()
+        self._start_ensemble(self.tested_members)
+
+    def _start_ensemble(self, members: int | None) -> None:
+        every = self.reading.every
+        self.ensemble = None if members is None else EnsembleTest(self.emulator, members, every=every)
+
+    def on_validation_epoch_end(self) -> None:
+        errors = self.valid_errors.compute()
+        trained = self.emulator.frames * self.unroll
+        horizon = trained * self.reading.every // self.reading.between  # in frames of the data
+        overall = overall_error(errors, max(1, horizon))
+        if self.ensemble is not None:
+            self.ensemble.gather()
+            overall = torch.tensor(self.ensemble.overall_score(), device=self.device)
+        self.log_dict({f"valid/{name}": value for name, value in (errors | {preflight.OVERALL: overall}).items()})
+
+    def on_test_epoch_end(self) -> None:
+        if self.ensemble is not None:
+            self.ensemble.gather()
+        self.log_dict({f"test/{name}": value for name, value in self.test_errors.compute().items()})
+
+
+def load_module(path: Path) -> EmulatorModule:
+    """Load the module of a checkpoint onto the CPU.
+
+    Raises:
+        DataError, ConfigError: if the file is not a checkpoint of an emulator, or of a newer version.
+    """
+    content = checkpoints.read_checkpoint(path)
+    stored = content.get("hyper_parameters", {})
+    if not isinstance(stored, dict) or not isinstance(stored.get("scene", {}), dict):
+        raise DataError(f"{path} is not a checkpoint of an emulator: its hyperparameters are not named values.")
+    try:
+        module = EmulatorModule(**stored)
+        module.on_load_checkpoint(content)
+        module.load_state_dict(content["state_dict"])
+    except NmpmError:
+        raise
+    except Exception as error:  # hyperparameters of a foreign or damaged file may have any type and value
+        reason = f"{type(error).__name__}: {one_line(error)}"
+        raise DataError(f"{path} is not a checkpoint of an emulator of this version ({reason}).") from error
+    return module
+
+
+def check_window(batch: object) -> Window:
+    """The batch; raises ConfigError if another loader than nmpm's has made it."""
+    if isinstance(batch, Window):
+        return batch
+    raise ConfigError(
+        f"The loader's batches are of the type {type(batch).__name__}, not nmpm.particles.Window: give the Trainer a"
+        " datamodule, nmpm.TrajectoryDataModule(path=...), or a DataLoader of windows."
+    )
 
 
 def repeated(batch: B, members: int) -> B:

@@ -119,7 +119,8 @@ def load_checkpoint(path: Path) -> Pretrained:
 
 def _load_module(path: Path) -> EmulatorModule:
     """The module of a checkpoint, after its size has been checked."""
-    from nmpm.training.checkpoints import load_module, read_checkpoint  # imports Lightning, which entries do without
+    from nmpm.training.checkpoints import read_checkpoint
+    from nmpm.training.module import load_module  # imports Lightning, which entries do without
 
     try:
         stored = read_checkpoint(path).get("hyper_parameters")

@@ -24,7 +24,8 @@ from nmpm.emulator import Emulator
 from nmpm.emulator.adaptation import adapted
 from nmpm.emulator.digests import float32_digest
 from nmpm.errors import ZooError
-from nmpm.training.checkpoints import load_module, read_checkpoint
+from nmpm.training.checkpoints import read_checkpoint
+from nmpm.training.module import load_module
 from nmpm.zoo.card import BEST, CARD, CONFIG, FORMAT, SCENES, WEIGHTS, intervals, stress_digest
 from nmpm.zoo.pretrained import Pretrained
 from nmpm.zoo.refresh import write_card, write_index, writing

@@ -13,8 +13,8 @@ from nmpm.errors import ConfigError, DataError
 from nmpm.optimizers import SOAP
 from nmpm.processors import Identity
 from nmpm.training import EmulatorModule
-from nmpm.training.checkpoints import load_module
 from nmpm.training.losses import PositionLoss
+from nmpm.training.module import load_module
 from nmpm.transfer import Nearest
 from tests.conftest import make_dataset
 from tests.trainings import TINY, data_of, module_of, trainer_of

@@ -8,7 +8,7 @@ import torch
 from nmpm.errors import ConfigError
 from nmpm.metrics import FieldMSE
 from nmpm.training import EmulatorModule
-from nmpm.training.checkpoints import load_module
+from nmpm.training.module import load_module
 from nmpm.zoo.pretrained import Pretrained
 from tests.scenes import box, cloud, window_of
 from tests.trainings import data_of, module_of, trainer_of

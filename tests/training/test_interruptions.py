@@ -35,7 +35,7 @@ AVERAGING = {"class_path": "lightning.pytorch.callbacks.EMAWeightAveraging", "in
 SAVING = "nmpm.training.checkpoints:torch.save"
 BEST = "nmpm.training.callbacks.savers:BestCheckpoint"
 LAST = "nmpm.training.callbacks.savers:LastCheckpoint"
-MODULE = "nmpm.training.evaluation:EvaluatedModule"
+MODULE = "nmpm.training.module:EmulatorModule"
 # Saved are last.ckpt at step 2 and before its validation, best.ckpt and last.ckpt after it, …
 MOMENTS = {
     "when a step is over": (f"{LAST}.on_train_batch_end", 2),

@@ -23,7 +23,7 @@ from nmpm.errors import ConfigError
 from nmpm.optimizers import SOAP
 from nmpm.particles import Window
 from nmpm.processors import FNO, TFNO, Axial, ConvNeXt, UNet
-from nmpm.training.checkpoints import load_module
+from nmpm.training.module import load_module
 from nmpm.transfer import Nearest, Quadratic
 from tests.trainings import QUIET, TINY, Record
 

@@ -18,8 +18,8 @@ from nmpm.metrics import MSE
 from nmpm.optimizers import SOAP
 from nmpm.training import EmulatorModule
 from nmpm.training.callbacks.outputs import ReportWriter
-from nmpm.training.checkpoints import load_module
 from nmpm.training.losses import PositionLoss
+from nmpm.training.module import load_module
 from nmpm.training.optimization import Schedule
 from nmpm.transfer import Nearest, without_kernels
 from tests.trainings import TINY, Record, data_of, module_of, trainer_of
