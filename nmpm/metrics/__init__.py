@@ -1,8 +1,7 @@
 """Rollout metrics; those of others are named by their class path in a configuration."""
 
-from nmpm.metrics.base import RolloutMetric
 from nmpm.metrics.earth_mover import EarthMover, check_emd, earth_mover, earth_mover_of_materials
-from nmpm.metrics.mse import MSE, FieldMSE, overall_error
+from nmpm.metrics.mse import MSE, FieldMSE, RolloutMetric, overall_error
 
 __all__ = [
     "MSE",

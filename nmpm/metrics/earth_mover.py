@@ -14,7 +14,7 @@ from torchmetrics.utilities import dim_zero_cat
 
 from nmpm._support.messages import require
 from nmpm.errors import NmpmError
-from nmpm.metrics.base import RolloutMetric
+from nmpm.metrics.mse import RolloutMetric
 from nmpm.particles import Window
 
 _MOST_PIVOTS = 10**9  # of the network simplex: far more than it needs

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from nmpm.emulator.members import mean_pair_distance
 from nmpm.grid import counting_grid
+from nmpm.metrics.mse import particles_there
 from nmpm.metrics.quantities import energies, front, into_domain, mean_height, volume_fractions
 from nmpm.particles import Window
 from nmpm.scene import Scene
@@ -257,5 +258,5 @@ def _mean_kinetic_energy(scene: Scene, window: Window) -> float:
 def _squared_errors(window: Window, targets: list[int], position: Tensor) -> Tensor:
     """Mean squared error of the members (M, t, N, D) in some of the frames to predict, (t,), float64."""
     squared = (position - window.target[0, targets]).square().mean((0, 3)).double()
-    there = window.mask if window.present is None else window.present[0, 2:][targets] & window.mask
+    there = particles_there(window)[0, targets]
     return squared.where(there, 0.0).sum(1) / there.sum(1)

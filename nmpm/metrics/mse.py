@@ -1,4 +1,4 @@
-"""Mean squared errors of rollouts.
+"""Rollout metrics: torchmetrics that take whole rollouts and add up over batches and processes; mean squared errors.
 
 *MSE at h*: the mean over predicted frames 1 … h, particles that move and dimensions, of the squared position error, in
 domain length squared, from a rollout that starts with frames 0 and 1; *full* is h = T - 2. Averaged over trajectories.
@@ -7,7 +7,9 @@ Evolving fields have an error of their own, over the full rollout.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -15,11 +17,35 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
-from nmpm.metrics.base import RolloutMetric
 from nmpm.particles import Window
 
 _EMPTY = -1.0
 """Stands for the error of a frame in which there is no particle."""
+
+
+class RolloutMetric(Metric, ABC):
+    """A measure of rollouts against recorded trajectories. Subclasses declare their states by `add_state`."""
+
+    cheap: ClassVar[bool] = True
+    """Whether validations compute it; tests compute every metric."""
+
+    compared: ClassVar[bool] = True
+    """Whether it is computed for the trivial predictors too."""
+
+    full_state_update = False
+
+    @abstractmethod
+    def update(self, window: Window, predicted: Tensor) -> None:
+        """Add rollouts.
+
+        Args:
+            window: B recorded trajectories of T + 2 frames, of the data where these have only some of the model's.
+            predicted: (B, T, N, D) positions in domain length, from the window's first two frames.
+        """
+
+    @abstractmethod
+    def compute(self) -> dict[str, Tensor]:
+        """Means over all trajectories added, by the names under which they are reported."""
 
 
 def overall_error(errors: Mapping[str, Tensor], horizon: int) -> Tensor:
@@ -56,16 +82,11 @@ class MSE(RolloutMetric):
         self.add_state("lengths", default=[], dist_reduce_fx="cat")
 
     def update(self, window: Window, predicted: Tensor) -> None:
-        mask = window.mask
         # Each frame in the positions' precision, as not every device has float64; sums over frames follow in `curves`.
-        squared = (predicted - window.target).square().mean(-1)
-        if window.present is None:
-            per_frame = (squared * mask.unsqueeze(1)).sum(-1) / mask.sum(-1, keepdim=True)
-        else:
-            there = window.present[:, 2:] & mask.unsqueeze(1)
-            number = there.sum(-1)
-            per_frame = torch.where(there, squared, 0.0).sum(-1) / number.clamp(min=1)
-            per_frame = torch.where(number > 0, per_frame, _EMPTY)
+        squared, there = (predicted - window.target).square().mean(-1), particles_there(window)
+        number = there.sum(-1)
+        per_frame = torch.where(there, squared, 0.0).sum(-1) / number.clamp(min=1)
+        per_frame = torch.where(number > 0, per_frame, _EMPTY)
         self.squared.append(per_frame.flatten().float())  # type: ignore[union-attr]  # (a list until gathered)
         self.lengths.append(  # type: ignore[union-attr]  # (likewise)
             torch.full((len(per_frame),), per_frame.shape[1], device=per_frame.device)
@@ -145,9 +166,12 @@ class FieldMSE(Metric):
 
 def _squared(difference: Tensor, window: Window) -> Tensor:
     """Sum over trajectories of the mean square of (B, T, N) differences over frames and the particles there."""
-    if window.present is None:
-        squared = difference.square() * window.mask.unsqueeze(1)
-        return (squared.sum((1, 2)) / (window.mask.sum(1) * difference.shape[1])).sum()
-    there = window.present[:, 2:] & window.mask.unsqueeze(1)
+    there = particles_there(window)
     squared = torch.where(there, difference.square(), 0.0)
     return (squared.sum((1, 2)) / there.sum((1, 2)).clamp(min=1)).sum()
+
+
+def particles_there(window: Window) -> Tensor:
+    """(B, T, N) bool, which particles are there in the frames to predict."""
+    mask = window.mask.unsqueeze(1)
+    return mask.expand(-1, window.target.shape[1], -1) if window.present is None else window.present[:, 2:] & mask

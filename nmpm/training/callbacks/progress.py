@@ -62,12 +62,12 @@ class Progress(ProgressBar):
 
     def on_validation_batch_end(self, trainer: Trainer, *_: Any) -> None:
         if trainer.state.fn != TrainerFn.FITTING:
-            self._count_batch()
+            self.on_test_batch_end()
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         error = trainer.callback_metrics.get("valid/mse")
         if trainer.state.fn != TrainerFn.FITTING:
-            self._close()
+            self.on_exception()
         elif error is not None and not trainer.sanity_checking:
             self._error = f"validation error {with_unit(float(error))}"
             self._show(trainer, "training")
@@ -79,35 +79,24 @@ class Progress(ProgressBar):
         self._open("predicting", sum(trainer.num_predict_batches))
 
     def on_test_batch_end(self, *_: Any) -> None:
-        self._count_batch()
+        if self._advance is not None:
+            self._advance()
 
-    def on_predict_batch_end(self, *_: Any) -> None:
-        self._count_batch()
-
-    def on_train_end(self, *_: Any) -> None:
-        self._close()
-
-    def on_test_end(self, *_: Any) -> None:
-        self._close()
-
-    def on_predict_end(self, *_: Any) -> None:
-        self._close()
+    on_predict_batch_end: Any = on_test_batch_end
 
     def on_exception(self, *_: Any) -> None:
-        self._close()
+        """Close the bar, as at the end of a training, a test or a prediction."""
+        self._open_bar.close()
+        self._advance = None
+
+    on_train_end: Any = on_exception
+    on_test_end: Any = on_exception
+    on_predict_end: Any = on_exception
 
     def _open(self, what: str, total: float, done: int = 0) -> None:
         if self._enabled:
             bar = progress_bar(what, int(total) if math.isfinite(total) else None, done)
             self._advance = self._open_bar.enter_context(bar)
-
-    def _count_batch(self) -> None:
-        if self._advance is not None:
-            self._advance()
-
-    def _close(self) -> None:
-        self._open_bar.close()
-        self._advance = None
 
     def _show(self, trainer: Trainer, doing: str) -> None:
         if self._advance is None:
