@@ -13,14 +13,8 @@ from nmpm.viz import LabelledTrajectories
 def labelled_trajectories(scene: Scene, window: Window, predicted: Tensor, title: str = "") -> LabelledTrajectories:
     """The first trajectory of a batch beside its prediction, in its own gravity.
 
-    Both start with the two frames that the prediction started from; both end where the prediction is not finite, which
-    the title then says.
-
-    Args:
-        scene: Of the trajectories.
-        window: The recorded ones.
-        predicted: (B, T, N, D) positions after the first two frames, in domain length.
-        title: Of the picture.
+    Both start with the two frames that the prediction, (B, T, N, D) positions, started from; both end where it is not
+    finite, which the title then says.
     """
     real = window.mask[0]
     truth = window.recorded[0][:, real]

@@ -130,8 +130,8 @@ def field_error(
 
     Args:
         scene: Gives domain and particle spacing.
-        ours: (T, N, D) positions; those outside of the domain count as `into_domain` moves them.
-        theirs: (T, N, D) likewise.
+        ours: (T, N, D) positions, as `theirs`; those outside of the domain count as `into_domain` moves them.
+        theirs: (T, N, D).
         material: (N,) index into the scene's materials.
         there: (T, N) bool, which particles count in each frame; all when left out.
         volume: (N,) of each particle, in any unit; all the same when left out.
@@ -152,13 +152,7 @@ def field_error(
 
 
 def density_crps(scene: Scene, window: Window, members: Tensor) -> float:
-    """Mean over cells, materials and evenly spaced frames of the fair CRPS of the density.
-
-    Args:
-        scene: Gives domain, materials and particle spacing.
-        window: Of one scene; of its particles those count that are present.
-        members: (M, T, N, D) positions.
-    """
+    """Mean over cells, materials and evenly spaced frames of the fair CRPS of the density of members (M, T, N, D)."""
     scores = []
     for frame in _evenly_spaced(members.shape[1], _FIELD_FRAMES).tolist():
         recorded, predicted = window.recorded[:, frame + 2], members[:, frame]
@@ -202,12 +196,7 @@ def recorded_energy_gain(scene: Scene, window: Window, predicted: Tensor) -> flo
 def energy_gain(scene: Scene, path: Tensor, material: Tensor, gravity: Tensor, volume: Tensor | None = None) -> float:
     """Most energy in a path beyond that between its first two frames, as a share of that; 0 where that has none.
 
-    Args:
-        scene: Gives bounds and densities.
-        path: (T, N, D) positions of all moving particles.
-        material: (N,) index into the scene's materials.
-        gravity: (D,) in length per frame squared.
-        volume: (N,) of each particle, in any unit; all the same when left out.
+    Arguments as of `energies`.
     """
     total = energies(scene, path.double(), material, gravity.double(), volume)[1]
     initial = float(total[0])

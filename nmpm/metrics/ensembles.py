@@ -38,11 +38,7 @@ LEVELS = (50, 90)
 def fair_crps(members: Tensor, truth: Tensor) -> Tensor:
     """Continuous ranked probability score of each number, *S: E|X - y| - E|X - X'| / 2, unbiased in M.
 
-    The absolute error of a single member.
-
-    Args:
-        members: (M, *S).
-        truth: (*S).
+    The absolute error of a single member. Members are (M, *S), the truth (*S).
     """
     count = len(members)
     distance: Tensor = (members - truth).abs().mean(0)
@@ -56,10 +52,7 @@ def fair_energy_score(members: Tensor, truth: Tensor) -> Tensor:
     """Energy score (): E‖X - y‖ - E‖X - X'‖ / 2, unbiased in M, with the root mean square over all axes as the norm.
 
     Unlike the mean of `fair_crps` it also judges how the numbers vary together. The distance of a single member.
-
-    Args:
-        members: (M, *S).
-        truth: (*S).
+    Members are (M, *S), the truth (*S).
     """
     rows = members.flatten(1)
     distance: Tensor = (rows - truth.flatten()).square().mean(1).sqrt().mean()

@@ -22,7 +22,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.modules.conv import _ConvNd
 
 from nmpm._support.threads import map_ranges
-from nmpm.emulator import Bundle, Emulator, Prescribed, Rollout, RolloutContext
+from nmpm.emulator import Bundle, Emulator, Prescribed, Rollout
 from nmpm.emulator.rollouts import Call, unroll_with_gradients
 from nmpm.particles import Particles, Window
 
@@ -30,12 +30,6 @@ T = TypeVar("T")
 
 MOST_PARTS = 4
 """Of a batch: with more, threads wait for Python's interpreter lock, which a part holds for about 15 ms."""
-
-
-def direct(emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
-    """A call of the emulator that keeps its activations for the backward pass."""
-    bundle: Bundle = emulator(particles, context)
-    return bundle
 
 
 def predict_window(
@@ -49,14 +43,8 @@ def predict_window(
 ) -> Rollout:
     """The frames of a training step, with gradients discounted from each bundle to the one before.
 
-    Args:
-        emulator: In training mode.
-        start: Of the windows, perhaps with noise on its positions.
-        window: Says which particles enter and leave, and how obstacles move.
-        bundles: How many.
-        call: Keeps a bundle's activations, or computes them again.
-        discount: In [0, 1].
-        noise: (B, M, bundles, Z, *S) of M members of each of B windows, which follow each other in `start`.
+    `start` may have noise on its positions; the window says which particles enter and leave, and how obstacles move.
+    The noise is (B, M, bundles, Z, *S), of M members of each of B windows, which follow each other in `start`.
     """
 
     def state_after(bundle: Bundle, start: Particles) -> Particles:
@@ -104,10 +92,7 @@ def split_rows(count: int, parts: int) -> list[slice]:
 def on_threads(function: Callable[[slice], T], rows: Sequence[slice], threads: int) -> list[T]:
     """The function's results for each part, in order, computed under the caller's gradient and autocast modes.
 
-    Args:
-        function: Is called from several threads, in each of which torch's operations use one thread.
-        rows: From `split_rows`.
-        threads: How many work at most.
+    It is called from several threads, in each of which torch's operations use one thread.
     """
     inner = torch.get_num_threads()
     gradients, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
@@ -172,18 +157,6 @@ def _with_network(emulator: Emulator, network: nn.Module) -> Emulator:
     return other
 
 
-def error_of_rows(
-    error: Callable[[Emulator, Particles, Window, Tensor | None], Tensor],
-    start: Particles,
-    window: Window,
-    noise: Tensor | None,
-    emulator: Emulator,
-    rows: slice,
-) -> Tensor:
-    """`error(emulator, start, window, noise)` of some of the batch's windows."""
-    return error(emulator, start.scenes(rows), window.scenes(rows), None if noise is None else noise[rows])
-
-
 def mean_over_parts(
     error: Callable[[Emulator, slice], Tensor],
     mask: Tensor,
@@ -194,13 +167,7 @@ def mean_over_parts(
 ) -> Tensor:
     """The mean error () over the particles of all parts, with gradients to the emulator's weights.
 
-    Args:
-        error: The mean over the particles of a part, with gradients.
-        mask: (B, N) or (B, T, N) bool, True for particles.
-        rows: From `split_rows`.
-        emulator: Computes the parts. Weights that require gradients get them.
-        networks: Of former steps.
-        threads: How many threads work at most.
+    `error` is the mean over the particles of a part; `mask`, (B, N) or (B, T, N), says which particles count.
     """
     if len(rows) == 1:
         return error(emulator, rows[0])

@@ -61,16 +61,7 @@ class Counts(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, cells: Tensor, material: Tensor, mask: Tensor, grid: Grid, materials: int) -> Tensor:
-        """(B, F, size, M) numbers.
-
-        Args:
-            ctx: Keeps what the backward pass needs.
-            cells: (B, F, N, D) positions in cells at F frames.
-            material: (B, N) indices.
-            mask: (B, N) bool, False for padding.
-            grid: Of 2 axes.
-            materials: M.
-        """
+        """(B, F, size, M) numbers, of (B, F, N, D) positions in cells and (B, N) materials, on a grid of 2 axes."""
         counts = np.zeros((*cells.shape[:2], grid.size, materials), np.float32)
         none, kinds = np.empty((cells.shape[2], 0), np.float32), material_rows(material, materials)
         space = (grid.shape, grid.periodic, _LINEAR)
@@ -108,16 +99,7 @@ class Counts(torch.autograd.Function):
 
 @jit_sum
 def sum_squares(predicted: Any, target: Any, mask: Any, spacing: Any, frames: Any, errors: Any) -> Any:
-    """Fill in the errors of the bundles of a scene.
-
-    Args:
-        predicted: (T, N, D) positions.
-        target: (T, N, D), likewise.
-        mask: (N,) bool.
-        spacing: (D,), the cells' widths.
-        frames: To a bundle.
-        errors: (T / frames,), is filled.
-    """
+    """Fill in the `errors` (T / frames,) of the bundles of a scene, of positions (T, N, D) and `spacing` (D,)."""
     axes, scale = predicted.shape[2], 1 / (frames * predicted.shape[2] * np.float64(mask.sum()))
     for bundle in range(len(errors)):
         total = 0.0

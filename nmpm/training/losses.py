@@ -173,12 +173,7 @@ def last_frames(window: Window, frames: int, bundle: int) -> tuple[tuple[slice |
 
 
 def _last_observed(observed: Tensor, bundle: int) -> tuple[Tensor, Tensor]:
-    """Indices (B, 1) and (B, K) of the last frame of each bundle that was observed; the last one if none was.
-
-    Args:
-        observed: (B, K m) whether each frame was.
-        bundle: m.
-    """
+    """Indices (B, 1) and (B, K) of the last frame of each bundle of `observed` (B, K m); the last one if none was."""
     backwards = observed.unflatten(1, (-1, bundle)).flip(2).int()
     ends = torch.arange(bundle - 1, observed.shape[1], bundle, device=observed.device)
     return torch.arange(len(observed), device=observed.device).unsqueeze(1), ends - backwards.argmax(2)
@@ -200,15 +195,9 @@ def field_error(
     frames: int,
     power: float = 1.0,
 ) -> Tensor:
-    """The error () of evolving fields in units of their spread: a mean over particles, summed over fields.
+    """The error () of evolving fields (B, K m, N) in units of their spread: a mean over particles, summed over fields.
 
-    Args:
-        predicted: (B, K m, N) by name, m frames to a bundle. Fields that have no target are left out.
-        target: Likewise.
-        window: Says which particles count.
-        spread: () of each field in the training data.
-        frames: m.
-        power: As of `PositionLoss`.
+    Fields that have no target are left out.
     """
     total = torch.zeros((), device=window.mask.device)
     for name, values in target.items():
@@ -221,16 +210,9 @@ def field_error(
 
 
 def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) -> Tensor:
-    """Mean over frames, real particles and dimensions of the squared position error (), in cells².
+    """Mean () over frames, real particles and dimensions of the squared error of positions (B, T, N, D), in cells².
 
-    Args:
-        predicted: (B, T, N, D) positions in domain length.
-        target: (B, T, N, D), likewise.
-        mask: (B, N) bool, False for padding. Without real particles, the error is NaN.
-        grid: Gives the cells' size.
-
-    Raises:
-        ValueError: if the shapes differ.
+    NaN without real particles.
     """
     check_comparable(predicted, target, frames=1)
     squared = grid.to_cell_displacement(predicted - target, predicted.dtype).square() * mask[:, None, :, None]
@@ -281,13 +263,8 @@ def density_error(
     Position errors hardly notice a liquid that slowly loses its volume, as neighbours swap places all the time; its
     density tells. As Σ φ is the particles' volume, the error is a mean over particles, as the position error is.
 
-    Args:
-        predicted: (B, F, N, D) positions in domain length, at F frames.
-        target: (B, F, N, D), likewise.
-        window: Says which particles are real, of which material and size.
-        scene: Gives the materials and a particle's volume.
-        grid: Where densities are compared, by linear weights.
-        there: (B, F, N) bool, which particles count in each frame; the real ones when left out.
+    Positions are (B, F, N, D), at F frames; `there`, (B, F, N), are the particles that count in each, the real ones if
+    None.
     """
     predicted_fraction, true_fraction = (
         volume_fractions(position, window, scene, grid, there) for position in (predicted, target)
@@ -311,32 +288,18 @@ def density_score(
 
 
 def volume_fractions(position: Tensor, window: Window, scene: Scene, grid: Grid, there: Tensor | None = None) -> Tensor:
-    """(B, F, nodes and materials) volume fractions by linear weights, of positions (B, F, N, D).
-
-    Args and gradients as `density_error`.
-    """
+    """(B, F, nodes and materials) volume fractions by linear weights; arguments and gradients as of `density_error`."""
     cells, fraction = grid.to_cells(position, position.dtype), scene.particle_volume / grid.cell_volume
     kernels = there is None and takes("numba", TRAINING_ERRORS, PositionPair(position, position.detach(), grid))
     if kernels and (sizes := scene_volumes(window.volume, window.mask)) is not None:
-        return (fraction * sizes.view(-1, 1, 1, 1) * _kernel_counts(cells, window, scene, grid)).flatten(2)
-    volume = _volumes(window, position.shape[1], scene, there).to(position.dtype)
-    sums = Linear().p2g(volume.flatten(0, 1), cells.flatten(0, 1), grid)
-    fractions: Tensor = fraction * sums.flatten(1)
-    by_frame: Tensor = fractions.unflatten(0, position.shape[:2])
-    return by_frame
+        from nmpm.training.kernels import Counts
 
-
-def _volumes(window: Window, frames: int, scene: Scene, there: Tensor | None) -> Tensor:
-    """(B, F, N, M) volume of each particle, as a multiple of the scene's, at its material; 0 if it does not count."""
+        numbers: Tensor = Counts.apply(cells, window.material, window.mask, grid, len(scene.materials))  # type: ignore[no-untyped-call]
+        return (fraction * sizes.view(-1, 1, 1, 1) * numbers).flatten(2)
     kinds = torch.arange(len(scene.materials), device=window.material.device)
-    there = window.mask.unsqueeze(1).expand(-1, frames, -1) if there is None else there
-    member = (window.material.unsqueeze(-1) == kinds).unsqueeze(1) & there.unsqueeze(-1)
-    return member if window.volume is None else member * window.volume[:, None, :, None]
-
-
-def _kernel_counts(cells: Tensor, window: Window, scene: Scene, grid: Grid) -> Tensor:
-    """The number of particles of each material on the nodes by linear weights, (B, F, size, M)."""
-    from nmpm.training.kernels import Counts
-
-    counts: Tensor = Counts.apply(cells, window.material, window.mask, grid, len(scene.materials))  # type: ignore[no-untyped-call]
-    return counts
+    there = window.mask.unsqueeze(1).expand(-1, position.shape[1], -1) if there is None else there
+    volume = (window.material.unsqueeze(-1) == kinds).unsqueeze(1) & there.unsqueeze(-1)
+    volume = (volume if window.volume is None else volume * window.volume[:, None, :, None]).to(position.dtype)
+    sums = Linear().p2g(volume.flatten(0, 1), cells.flatten(0, 1), grid).flatten(1)
+    fractions: Tensor = (fraction * sums).unflatten(0, position.shape[:2])
+    return fractions

@@ -42,8 +42,6 @@ from nmpm.training.augmentation import check_jitter, check_mirrors, mirror_half,
 from nmpm.training.backpropagation import (
     MOST_PARTS,
     CastNetworks,
-    direct,
-    error_of_rows,
     mean_over_parts,
     on_threads,
     predict_window,
@@ -271,8 +269,11 @@ class EmulatorModule(LightningModule):
             error = self._recorded.mean_error(mean_error, self.emulator, emulator, start, batch, count)
         else:
             rows, noise = self.rows(batch), training_noise(emulator, len(start.mask), self.members, count)
-            of = partial(error_of_rows, mean_error, start, batch, noise)
-            error = mean_over_parts(of, counts, rows, emulator, self._networks, self.threads or len(rows))
+
+            def error_of(moved: Emulator, part: slice) -> Tensor:
+                return mean_error(moved, start.scenes(part), batch.scenes(part), None if noise is None else noise[part])
+
+            error = mean_over_parts(error_of, counts, rows, emulator, self._networks, self.threads or len(rows))
         loss, logged = global_mean(error, counts.sum() if counts.dim() == 2 else counts.sum() / counts.shape[1])
         self.log("train/loss", logged)
         return loss
@@ -286,7 +287,7 @@ class EmulatorModule(LightningModule):
         """
         noise = training_noise(emulator, len(start.mask), self.members, count) if noise is None else noise
         start, members = repeated(start, self.members), repeated(window, self.members)
-        call = recomputed if self.recompute else direct
+        call = recomputed if self.recompute else Emulator.__call__  # (which keeps activations)
         predicted = predict_window(emulator, start, members, count, call, self.gradient_discount, noise)
         with torch.autocast(predicted.position.device.type, enabled=False):
             return self.loss(predicted, window, emulator)

@@ -52,15 +52,10 @@ class RecordedSteps:
     def mean_error(
         self, error: Error, emulator: Emulator, moved: Emulator, start: Particles, window: Window, settings: Hashable
     ) -> Tensor:
-        """`error(moved, start, window)`, with gradients to the weights.
+        """`error(moved, start, window)`, with gradients to the weights of `emulator`.
 
-        Args:
-            error: Is recorded; it depends on nothing that changes but its arguments and `settings`.
-            emulator: Holds the weights.
-            moved: The same, or its copy from `with_grid_moved`.
-            start: The start of the windows, with noise on its positions.
-            window: The windows.
-            settings: What else the error depends on, such as the number of bundles.
+        The error is recorded: it depends on nothing that changes but its arguments and `settings`. `moved` is the
+        emulator, or its copy from `with_grid_moved`.
         """
         inputs = None if self._failed else _inputs(emulator, moved, start, window)
         step = inputs and self._find(error, emulator, window, inputs, settings)

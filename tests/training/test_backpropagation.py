@@ -7,13 +7,13 @@ import pytest
 import torch
 
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.emulator import unroll
+from nmpm.emulator import Emulator, unroll
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.rollouts import recomputed, unroll_with_gradients
 from nmpm.errors import ConfigError
 from nmpm.processors import FNO
 from nmpm.training import EmulatorModule
-from nmpm.training.backpropagation import CastNetworks, direct, discount_gradients, mean_over_parts, split_rows
+from nmpm.training.backpropagation import CastNetworks, discount_gradients, mean_over_parts, split_rows
 from nmpm.training.callbacks.threads import Threads
 from tests.trainings import TINY
 
@@ -83,8 +83,8 @@ def test_predictions_do_not_depend_on_the_discount(step):
         bundles = unroll_with_gradients(module.emulator, batch.initial, BUNDLES, call, state_after)
         return torch.cat([bundle.position for bundle in bundles], dim=1)
 
-    plain = positions(direct, 1.0)
-    assert torch.equal(plain, positions(direct, 0.5))
+    plain = positions(Emulator.__call__, 1.0)
+    assert torch.equal(plain, positions(Emulator.__call__, 0.5))
     assert torch.equal(plain, positions(recomputed, 0.0))
     state = batch.initial.with_motion(batch.initial.position.clone().requires_grad_(), batch.initial.velocity)
     assert not discount_gradients(state, 0.0).position.requires_grad  # cut gradients are not computed at all

@@ -39,11 +39,6 @@ class Trace:
     last: Tensor
 
     @property
-    def frames(self) -> int:
-        """T."""
-        return self.gain.shape[1]
-
-    @property
     def failures(self) -> Tensor:
         """(B, T): whether an invariant is broken: a particle lost, or more energy gained than `MOST_GAIN`."""
         return (self.lost > 0) | (self.gain > MOST_GAIN) | self.gain.isnan()
@@ -56,7 +51,7 @@ class Trace:
     def steps_to_failure(self) -> list[int]:
         """For each scene the first frame, from 1, at which an invariant is broken; T + 1 where none is."""
         first = self.failures.int().argmax(1) + 1
-        return torch.where(self.failures.any(1), first, self.frames + 1).tolist()
+        return torch.where(self.failures.any(1), first, self.gain.shape[1] + 1).tolist()
 
     def figures(self) -> dict[str, float]:
         """The figures that a line of the battery reports."""
@@ -68,13 +63,9 @@ class Trace:
 
 
 def trace_bundles(emulator: Emulator, start: Particles, bundles: Iterable[Tensor], every: int = 0) -> Trace:
-    """Measure a rollout bundle by bundle.
+    """Measure a rollout bundle by bundle, (B, m, N, D) positions each.
 
-    Args:
-        emulator: Gives scene and grid.
-        start: The state it started from.
-        bundles: (B, m, N, D) positions, one after the other.
-        every: Frames between two measures of the volume, rounded up to bundles; 0 for none.
+    The volume is measured `every` so many frames, rounded up to bundles; never for 0.
     """
     scene, real = emulator.scene, start.mask
     begun = energy_above_lowest(scene, start, start.position.unsqueeze(1), start.velocity.unsqueeze(1))
@@ -108,18 +99,10 @@ def trace_rollout(emulator: Emulator, start: Particles, frames: int, every: int 
 
 
 def energy_above_lowest(scene: Scene, start: Particles, position: Tensor, velocity: Tensor) -> Tensor:
-    """Kinetic and potential energy per mass of each scene, the potential from the bounds' lowest corner.
+    """Kinetic and potential energy per mass of each scene, (B, T), the potential from the bounds' lowest corner.
 
     Counted from there particle by particle: in a sum of large potentials, far from the origin, digits would be lost.
-
-    Args:
-        scene: Gives the bounds.
-        start: Gives gravity, materials and which particles are real.
-        position: (B, T, N, D).
-        velocity: (B, T, N, D) in length per frame.
-
-    Returns:
-        (B, T) in length² per frame².
+    Positions and velocities, per frame, are (B, T, N, D).
     """
     gravity = start.gravity[:, None, None]
     lowest = lowest_potential(scene, start.gravity)[:, None, None]
@@ -134,17 +117,7 @@ def is_lost(scene: Scene, position: Tensor) -> Tensor:
 
 
 def rms_distance(grid: Grid, mask: Tensor, one: Tensor, other: Tensor) -> Tensor:
-    """Root mean square distance of the same particles in two rollouts, over all scenes.
-
-    Args:
-        grid: Gives the cells.
-        mask: (B, N) bool, which particles are real.
-        one: (B, T, N, D) positions.
-        other: (B, T, N, D) positions.
-
-    Returns:
-        (T,) in cells.
-    """
+    """Root mean square distance, (T,) in cells, of the same particles in two rollouts (B, T, N, D), over all scenes."""
     squared = ((one - other) / one.new_tensor(grid.spacing)).square().sum(-1)
     return (torch.where(mask.unsqueeze(1), squared, 0.0).sum((0, 2)) / mask.sum()).sqrt()
 

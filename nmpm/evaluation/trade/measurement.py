@@ -56,15 +56,7 @@ class Store:
 
 
 def measure(choices: Sequence[Choice], scenes: Scenes, sweep: Sweep, store: Store, title: str = "trade") -> list[Point]:
-    """The points of all choices; what the store has is not measured again.
-
-    Args:
-        choices: Of `make_choices`.
-        scenes: What is predicted.
-        sweep: Measures and timing.
-        store: Keeps everything as soon as it is measured.
-        title: Of the progress.
-    """
+    """The points of all choices; the store keeps everything as soon as it is measured, and is not measured again."""
     with progress_bar(title, len(choices) * (len(scenes) + sweep.timing.rounds)) as step:
         rows = [measure_accuracy(choice, scenes, sweep.measures, store, step) for choice in choices]
         times = measure_times(choices, scenes, sweep.timing, store, step)
@@ -185,14 +177,7 @@ def _measure_scene(choice: Choice, scenes: Scenes, index: int, measures: Measure
 
 @dataclass(eq=False)
 class _Runner:
-    """A choice that is timed.
-
-    Args:
-        choice: What is timed.
-        key: Of its times in the store.
-        stored: Milliseconds by round; the memory; why it failed.
-        warm: Whether it has run before.
-    """
+    """A choice that is timed; stored, under its key, are milliseconds by round, the memory, or why it failed."""
 
     choice: Choice
     key: dict[str, Any]
@@ -203,12 +188,7 @@ class _Runner:
 def measure_times(choices: Sequence[Choice], scenes: Scenes, timing: Timing, store: Store, step: Step) -> list[Times]:
     """The times of all choices; those that lack a round take turns in it, in an order that changes.
 
-    Args:
-        choices: What to time.
-        scenes: What is predicted: round r predicts scene r, and the next ones where a choice takes several at once.
-        timing: Rounds and frames.
-        store: Keeps each time as soon as it is measured.
-        step: Called after each run.
+    Round r predicts scene r, and the next ones where a choice takes several at once; `step` is called after each run.
     """
     keys = [_times_key(choice, scenes, timing) for choice in choices]
     runners: dict[str, _Runner] = {}  # one for choices that are the same, such as the twin and that many substeps

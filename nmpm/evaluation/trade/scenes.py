@@ -104,10 +104,7 @@ def moving_frames(recording: Recording, scene: Scene) -> int:
 def find_scenes(dataset: str, count: int, facts: Options | None = None) -> Scenes:
     """Test scenes of an embedded dataset or of data of any format that is read, `count` at most; simulated if missing.
 
-    Args:
-        dataset: Name, or path.
-        count: Of scenes.
-        facts: That files do not state.
+    Facts are those that files do not state.
 
     Raises:
         ConfigError: if facts are stated of simulated scenes.

@@ -116,21 +116,12 @@ def fit_to_scenes(
     stride: Fraction | None = None,
     strict: bool = False,
 ) -> FittedModel:
-    """A model for scenes that need not be its own.
+    """A model for scenes that need not be its own; warns of what could not be matched.
 
-    Args:
-        name: Of the model.
-        emulator: The model.
-        scenes: What it is to predict.
-        materials: The model's by the data's name, as for `find_match`; left out for a model that lacks one of them.
-        stride: As for `find_match`.
-        strict: Likewise.
+    Materials (left out for a model that lacks one of them), stride and strict are those of `find_match`.
 
     Raises:
         ConfigError: if they cannot be matched, naming the model and the reason.
-
-    Warns:
-        UserWarning: of what could not be matched.
     """
     differing, weights = emulator.scene.differences(scenes.scene), weights_digest(emulator.state_dict())[:12]
     if not differing and not emulator.scene.aliases and emulator.scene.materials == scenes.scene.materials:
