@@ -109,8 +109,9 @@ def test_a_group_of_stress_tests_runs(nmpm):
 def test_a_loss_and_a_metric_train_and_are_read_back(nmpm):
     counts = ("--data.generate.counts", "{train: 1, valid: 0, test: 1}", "--trainer.limit_val_batches", "0")
     parts = ("--model.loss", "nmpm_points.Doubled", "--model.metrics+", "nmpm_points.First")
-    short = ("--model.cells", "16", "--trainer.max_steps", "1", "--trainer.default_root_dir", "trained")
-    status, text = nmpm("fit", "--data.name", "splash", *counts, *parts, *short)
-    assert (status, "mse@1" in text, "mse@8" in text) == (0, True, False), text
+    small = ("--model.cells", "16", "--model.frames", "2", "--model.processor.width", "4")
+    short = ("--trainer.max_steps", "1", "--trainer.default_root_dir", "trained")
+    status, text = nmpm("fit", "--data.name", "splash", *counts, *parts, *small, *short)
+    assert (status, "mse@1" in text) == (0, True), text
     status, text = nmpm("test", "trained", "--trust_config")
     assert (status, "mse@1" in text) == (0, True), text

@@ -85,13 +85,9 @@ def energies(
 
 
 def mean_height(scene: Scene, position: Tensor, gravity: Tensor, volume: Tensor) -> Tensor:
-    """Mean height above the lowest bound against gravity, (B,), in domain length.
+    """Mean height above the lowest bound against gravity, (B,), in domain length, of positions (B, N, D).
 
-    Args:
-        scene: Gives the bounds.
-        position: (B, N, D).
-        gravity: (B, D) or (1, D), not zero.
-        volume: (B, N) or (1, N) of each particle, in any unit; 0 for padding.
+    Gravity, (B, D) or (1, D), is not zero; volumes, (B, N) or (1, N), are 0 for padding.
     """
     up = -torch.nn.functional.normalize(gravity, dim=-1)
     low, high = position.new_tensor(scene.bounds).T
@@ -103,11 +99,7 @@ def mean_height(scene: Scene, position: Tensor, gravity: Tensor, volume: Tensor)
 def measure_shape(scene: Scene, grid: Grid, state: Particles, position: Tensor) -> dict[str, Tensor]:
     """How high the material of B scenes stands, how many cells it occupies and how crowded these are.
 
-    Args:
-        scene: Gives the bounds.
-        grid: Whose cells are counted.
-        state: Gives gravity, which must not be zero, and which particles are real.
-        position: (B, N, D) in domain length, all finite.
+    Gravity must not be zero, and all positions, (B, N, D), be finite.
 
     Returns:
         (B,) each: `height`, as `mean_height`; `occupied`, the cells that hold a particle; `crowding`, the particles per

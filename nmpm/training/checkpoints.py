@@ -75,16 +75,6 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return content
 
 
-def check_horizon(frames: int, unroll: int, horizon: int) -> None:
-    """Raise ConfigError if training windows are shorter than what a training step predicts; longer ones are cut."""
-    if horizon < frames * unroll:
-        raise ConfigError(
-            f"data.horizon = {horizon} is shorter than the {frames * unroll} frames that a training step predicts"
-            f" (model.frames = {frames} times model.unroll = {unroll}): give TrajectoryDataModule"
-            f" horizon={frames * unroll}, or unroll less."
-        )
-
-
 def check_same_scene(model: Scene, data: Scene) -> None:
     """Raise ConfigError, naming the facts in which they differ, if a model's scene is not that of its data."""
     different = model.differences(data)

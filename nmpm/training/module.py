@@ -199,8 +199,13 @@ class EmulatorModule(LightningModule):
         if isinstance(scene, Scene):
             checkpoints.check_same_scene(self.emulator.scene, scene)
             warn_of_ignored(self.emulator.scene, scene.fields)
-        if stage == TrainerFn.FITTING and isinstance(horizon, int):
-            checkpoints.check_horizon(self.emulator.frames, self.unroll, horizon)
+        frames = self.emulator.frames * self.unroll
+        if stage == TrainerFn.FITTING and isinstance(horizon, int) and horizon < frames:  # (longer windows are cut)
+            raise ConfigError(
+                f"data.horizon = {horizon} is shorter than the {frames} frames that a training step predicts"
+                f" (model.frames = {self.emulator.frames} times model.unroll = {self.unroll}): give"
+                f" TrajectoryDataModule horizon={frames}, or unroll less."
+            )
         if stage == TrainerFn.FITTING and isinstance(data, TrajectoryDataModule):
             preflight.check_evaluations(self.trainer, self, data)
 

@@ -29,7 +29,7 @@ from nmpm.scene import Scene
 from nmpm.sim import InitialState, Preset
 from nmpm.sim.preset import nudge
 
-Rollout = Callable[[int], Tensor]
+Run = Callable[[int], Tensor]
 """From a number of frames to (B, frames, N, D) predicted positions, in domain length."""
 
 Settings = Mapping[str, str | int | float]
@@ -76,7 +76,7 @@ class Choice(ABC):
         """Plain data on which its predictions depend, beside the scenes: the key of stored measurements."""
 
     @abstractmethod
-    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
+    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Run:
         """Load what the rollouts of some scenes start from, which is not timed.
 
         Returns:
@@ -145,7 +145,7 @@ class ModelChoice(Choice):
         }
         return identity | ({} if self.matched is None else {"reading": self.matched.identity})
 
-    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
+    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Run:
         window = scenes.window(indices)
         if (matched := self.matched) is not None:
             there = window.to(self.device)
@@ -186,7 +186,7 @@ class SimulatorChoice(Choice):
         # The number of frames of the preset's own trajectories does not matter.
         return {"preset": self.preset.with_frames(1).to_dict(), "revision": self.preset.revision, "nudge": self.nudge}
 
-    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
+    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Run:
         (index,) = indices
         start = self._draw(scenes, index)
         follow = follow_nearest(scenes.recordings[index].frames[0], start.position)
@@ -268,7 +268,7 @@ class PredictorChoice(Choice):
     def identity(self) -> Mapping[str, Any]:
         return {self.kind.value: self.name} | ({"enter_every": self.enter_every} if self.enter_every > 1 else {})
 
-    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
+    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Run:
         window = scenes.window(indices)
         batch, _, count, dim = window.frames.shape
 
@@ -326,7 +326,7 @@ class MembersChoice(ModelChoice):
     def identity(self) -> Mapping[str, Any]:
         return {**super().identity, "members": self.members, "nudge": self.nudge}
 
-    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Rollout:
+    def prepare(self, scenes: Scenes, indices: Sequence[int]) -> Run:
         (index,) = indices
         start, prescribed = self._start(scenes.window(indices))
         options = RolloutOptions(prescribed, members=self.members, seed=index, nudge=self.nudge)
