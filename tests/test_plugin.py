@@ -113,5 +113,5 @@ def test_a_loss_and_a_metric_train_and_are_read_back(nmpm):
     short = ("--trainer.max_steps", "1", "--trainer.default_root_dir", "trained")
     status, text = nmpm("fit", "--data.name", "splash", *counts, *parts, *small, *short)
     assert (status, "mse@1" in text) == (0, True), text
-    status, text = nmpm("test", "trained", "--trust_config")
+    status, text = nmpm("test", "trained", "--trust-config")
     assert (status, "mse@1" in text) == (0, True), text
