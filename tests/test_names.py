@@ -54,7 +54,7 @@ OPTIONS = {f"--{name}" for name in (*LIGHTNING, *SECTIONS)} | {
     if isinstance(word, ast.Constant)
 } | {label(field) for kind in commands(COMMANDS.values()) for field in fields(kind)}  # fmt: skip
 OTHER_PROGRAMS = re.compile(
-    r"pip install[^:;({]*|`hf [^`]*`|--include \{}|nmpm\.(?:plugins|readers|writers|scenes|commands)\b"
+    r"pip install[^:;({]*|`hf [^`]*`|--include \{}|nmpm\.(?:plugins|readers|writers|scenes|commands|stress)\b"
 )
 
 EXTRAS = {"install": 0, "require": 1}
