@@ -98,13 +98,13 @@ class Demo(DeviceOptions):
         from nmpm.zoo.starts import Start
 
         (file, page), model = self._files, load_model(self.model, self.device)
-        preset = training_preset(model)
+        preset = training_preset(model.scene, model.preset)
         if preset is None:
             raise self._no_simulator()
         choose_threads(model, 1)  # as many as the simulator's
         sys.stdout.write(f"Scene of {preset.name}, seed {self.seed}; simulator: {preset.generator}.\n")
         simulated, slow = _simulate(preset, self.seed, self.frames + 1)
-        window = scene_window(model, simulated)
+        window = scene_window(model.scene, simulated)
         clock, read_clock = clock_for(model.emulator.device)
         start = Start(model, model.scene, window.initial, window.initial, window)
         rollout, fast = start.predict(self.frames, Monitor(Policy.RECORD), read_clock)
@@ -115,7 +115,7 @@ class Demo(DeviceOptions):
                 fewer = dataclasses.replace(preset, substeps=substeps)
                 with contextlib.suppress(UnstableError):
                     again, taken = _simulate(fewer, self.seed, self.frames + 1)
-                    off = float(squared_errors(window, scene_window(model, again).target).mean())
+                    off = float(squared_errors(window, scene_window(model.scene, again).target).mean())
                     settings.append(Setting(f"{counted(substeps, 'substep')} instead of {preset.substeps}", taken, off))
         _print_times(settings, error, fast, f"{clock} on {device_name(model.emulator.device, 1)}")
         _print_errors(model.scene, window, rollout)

@@ -74,12 +74,12 @@ class MatchedRun:
             model = dataclasses.replace(model, emulator=adapted(model.emulator, recipe))
         chosen = None
         try:
-            match = match_data(model, data, *given)
+            match = match_data(model.emulator, model.name, data, *given)
         except ConfigError:
             chosen = _choose_materials(model, data, given) if checkpoint is None else None
             if chosen is None:
                 raise
-            match = match_data(model, data, *given._replace(materials=chosen))
+            match = match_data(model.emulator, model.name, data, *given._replace(materials=chosen))
         different = tuple(key for key in FORM if _differs(config["model"][key], match.recipe, key))
         stated = stated_keys(read_options(sys.argv[2:]), "model") if checkpoint is None else set()
         left_out = tuple(key for key in different if key in stated)

@@ -44,7 +44,7 @@ def start_of(model: Pretrained, options: RollOut) -> Start:
 
 def _scene_start(model: Pretrained, options: RollOut) -> Start:
     """A scene of the model's training, or thrown blocks; what it is is printed."""
-    gravity, preset = options.facts.gravity, training_preset(model)
+    gravity, preset = options.facts.gravity, training_preset(model.scene, model.preset)
     if options.particles is None and options.blocks is None and preset is not None:
         state = model.example(options.seed, gravity=gravity)
         solid = ", with obstacles" if state.obstacle.shape[1] else ""

@@ -204,7 +204,7 @@ def _with(values: Tensor, slots: slice, new: Tensor | float) -> Tensor:
 
 def simulator_of(model: Pretrained) -> Preset | None:
     """The preset that simulates a model's scenes from any state; None where there is none."""
-    preset = training_preset(model)
+    preset = training_preset(model.scene, model.preset)
     return None if isinstance(preset, MpmMixture) else preset
 
 

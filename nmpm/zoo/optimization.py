@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import logging
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -16,9 +14,7 @@ from nmpm.emulator.rollouts import rollout
 from nmpm.emulator.runtimes import RUNTIMES, Eager, Runtime, check_runtime
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
-
-if TYPE_CHECKING:
-    from nmpm.zoo.pretrained import Pretrained
+from nmpm.zoo.states import thrown_state
 
 AUTO = "auto"
 """Stands for the fastest of `RUNTIMES` that can run the model here, as measured."""
@@ -30,27 +26,26 @@ _BUNDLES, _ROUNDS = 4, 3  # of the rollouts that are timed
 _LOG = logging.getLogger(__name__)
 
 
-def fitting_count(model: Pretrained, count: int, blocks: int | None = None) -> int:
-    """The number of particles, halved until an example of so many blocks fits into a model's box."""
+def fitting_count(emulator: Emulator, count: int, blocks: int | None = None) -> int:
+    """The number of particles, halved until so many thrown blocks of them fit into the box."""
     try:
-        model.example(count=count, blocks=blocks)
+        thrown_state(emulator, 0, count, blocks)
     except ConfigError:
-        return fitting_count(model, count // 2, blocks) if count > 1 else count
+        return fitting_count(emulator, count // 2, blocks) if count > 1 else count
     return count
 
 
-def small_example(model: Pretrained) -> Particles:
+def small_example(emulator: Emulator) -> Particles:
     """The state by which runtimes are compared."""
-    return model.example(count=fitting_count(model, _EXAMPLE)).to(model.emulator.device)
+    return thrown_state(emulator, 0, fitting_count(emulator, _EXAMPLE)).to(emulator.device)
 
 
-def optimize(emulator: Emulator, runtime: str | Runtime, make_example: Callable[[], Particles]) -> Emulator:
+def optimize(emulator: Emulator, runtime: str | Runtime) -> Emulator:
     """The emulator with another runtime, compared with torch on an example.
 
     Args:
         emulator: In evaluation mode.
         runtime: One of `RUNTIMES`, or its name, or "auto".
-        make_example: Makes a state on the emulator's device.
 
     Raises:
         ConfigError: if there is no such runtime, it cannot run the model here, or its results differ from torch's;
@@ -59,25 +54,25 @@ def optimize(emulator: Emulator, runtime: str | Runtime, make_example: Callable[
     if isinstance(runtime, str):
         check_runtime(runtime, (AUTO, *RUNTIMES))
     if runtime != AUTO:
-        return _checked(emulator, runtime, make_example)
+        return _checked(emulator, runtime)
     fitting = []
     for name in (name for name, kind in RUNTIMES.items() if kind.automatic):
         try:
-            fitting.append(_checked(emulator, name, make_example))
+            fitting.append(_checked(emulator, name))
         except ConfigError as error:
             _LOG.info("%s", error)
     if len(fitting) == 1:
         return fitting[0]
-    seconds = {faster.runtime.name: _seconds(faster, make_example()) for faster in fitting}
+    seconds = {faster.runtime.name: _seconds(faster, small_example(emulator)) for faster in fitting}
     _LOG.info("Seconds of %d bundles: %s.", _BUNDLES, seconds)
     return min(fitting, key=lambda faster: seconds[faster.runtime.name])
 
 
-def _checked(emulator: Emulator, runtime: str | Runtime, make_example: Callable[[], Particles]) -> Emulator:
+def _checked(emulator: Emulator, runtime: str | Runtime) -> Emulator:
     """The emulator with a runtime whose results are torch's."""
     faster = emulator.with_runtime(runtime)
     if not isinstance(faster.runtime, Eager):
-        _check_deviation(emulator.with_runtime("eager"), faster, make_example())
+        _check_deviation(emulator.with_runtime("eager"), faster, small_example(emulator))
     return faster
 
 

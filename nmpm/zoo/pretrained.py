@@ -37,7 +37,7 @@ from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
 from nmpm.zoo.card import preset_of, stated_nudge
-from nmpm.zoo.optimization import AUTO, optimize, small_example
+from nmpm.zoo.optimization import AUTO, optimize
 from nmpm.zoo.states import THROWN, TOO_FAST, Bodies, StateBuilder, state_of, thrown_state
 
 if TYPE_CHECKING:
@@ -165,6 +165,11 @@ class Pretrained(Predictor):
         """Name of the simulator preset that made the training data; None for recorded or unknown data."""
         return preset_of(self.card)
 
+    @property
+    def _too_fast(self) -> float:
+        """The multiple of the calibrated speeds that is an error: none in data that were compared by a match."""
+        return math.inf if self.match else TOO_FAST
+
     def state(
         self,
         position: ArrayLike | Tensor,
@@ -205,7 +210,7 @@ class Pretrained(Predictor):
             UserWarning: if the velocities look as if they were per frame, particles start inside an obstacle, or the
                 positions' type is too coarse so far from the origin; naming fields that the model does not have.
         """
-        builder = StateBuilder(self.emulator, position, dtype, math.inf if self.match else TOO_FAST)
+        builder = StateBuilder(self.emulator, position, dtype, self._too_fast)
         return builder.build(velocity, material, obstacle, gravity, fields, bodies, volume).to(self.emulator.device)
 
     def start(self, trajectory: Trajectory, frame: int = 1, materials: Mapping[str, str] | None = None) -> Particles:
@@ -228,7 +233,7 @@ class Pretrained(Predictor):
             DataError: if the trajectory's materials are not the model's, no particle is there, or as for `state`.
             ConfigError: if there is no such frame.
         """
-        return state_of(self, trajectory, frame, materials)
+        return state_of(self.emulator, trajectory, frame, materials, self._too_fast)
 
     def example(
         self,
@@ -255,10 +260,10 @@ class Pretrained(Predictor):
         """
         from nmpm.zoo.scenes import drawn_state, training_preset  # (the simulators compile kernels by numba)
 
-        preset = training_preset(self) if count is None and blocks is None else None
+        preset = training_preset(self.scene, self.preset) if count is None and blocks is None else None
         if preset is None:
-            return thrown_state(self, seed, THROWN if count is None else count, blocks, gravity)
-        return drawn_state(self, preset, seed, gravity)
+            return thrown_state(self.emulator, seed, THROWN if count is None else count, blocks, gravity)
+        return drawn_state(self.emulator, preset, seed, gravity)
 
     def with_network(self, precision: str) -> Pretrained:
         """The same model with the network's weights in "float32" or, faster on most processors, in "bfloat16"."""
@@ -291,7 +296,7 @@ class Pretrained(Predictor):
         """
         from nmpm.zoo.matching import match_data  # imports all readers of data
 
-        match = match_data(self, data, materials, stride, strict)
+        match = match_data(self.emulator, self.name, data, materials, stride, strict)
         for warning in match.warnings:
             warnings.warn(warning, stacklevel=2)
         return self.matched(match)
@@ -321,7 +326,7 @@ class Pretrained(Predictor):
             ConfigError: if the runtime is not installed, cannot run the model here, or computes something else.
         """
         model = self if precision is None else self.with_network(precision)
-        return dataclasses.replace(model, emulator=optimize(model.emulator, runtime, lambda: small_example(model)))
+        return dataclasses.replace(model, emulator=optimize(model.emulator, runtime))
 
     def explain(self) -> None:
         """Print what computes rollouts and trainings on the model's device, and why nothing faster does."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from nmpm.data.format import Trajectory
 from nmpm.data.recordings import RecordingReader
 from nmpm.data.simulation import preset_metadata
 from nmpm.data.windows import collate
+from nmpm.emulator import Emulator
 from nmpm.errors import DataError
 from nmpm.particles import Particles, Window
 from nmpm.scene import Reading, Scene
@@ -21,19 +22,16 @@ from nmpm.sim import Preset, load_preset, preset_names
 from nmpm.sim.state import Progress
 from nmpm.zoo.states import StateBuilder
 
-if TYPE_CHECKING:
-    from nmpm.zoo.pretrained import Pretrained
-
 SAME = 1e-3
 """Relative difference up to which lengths, times and volumes of model and preset are the same."""
 
 
-def training_preset(model: Pretrained) -> Preset | None:
-    """The shipped preset whose scenes a model was trained on; None for recorded data, other simulators and scenes."""
-    if model.preset not in preset_names():
+def training_preset(ours: Scene, name: str | None) -> Preset | None:
+    """The shipped preset of a name, if there is one, and its scenes are those that a model was trained on."""
+    if name not in preset_names():
         return None
-    preset = load_preset(str(model.preset))
-    ours, theirs = model.scene, preset.scene
+    preset = load_preset(str(name))
+    theirs = preset.scene
     same = ours.materials == theirs.materials and ours.gravity_varies == theirs.gravity_varies
     same_frames = math.isclose(ours.dt, theirs.dt, rel_tol=SAME)
     return preset if same and same_frames and not scene_differences(ours, preset) else None
@@ -72,23 +70,23 @@ def simulate_scene(
     return Trajectory(made.position, made.particle_type, made.attributes, metadata=preset_metadata(preset))
 
 
-def scene_window(model: Pretrained, trajectory: Trajectory) -> Window:
+def scene_window(scene: Scene, trajectory: Trajectory) -> Window:
     """A simulated scene as tests read it: its first two frames to start from, and the others as the truth."""
     if trajectory.metadata is None:
         raise DataError("The trajectory lacks its metadata, which name the types of its particles.")
-    reading = Reading(model.scene)
+    reading = Reading(scene)
     reader = RecordingReader(trajectory.metadata, reading)
     return collate([reader.recording(trajectory, "the simulated scene")], reading)
 
 
-def drawn_state(model: Pretrained, preset: Preset, seed: int, gravity: Any) -> Particles:
+def drawn_state(emulator: Emulator, preset: Preset, seed: int, gravity: Any) -> Particles:
     """The state of the scene that a preset draws for a seed, one simulated frame later, where rollouts of tests start.
 
     Raises:
         DataError: if gravity is not the model's.
     """
-    pull = None
+    scene, pull = emulator.scene, None
     if gravity is not None:
-        stated = StateBuilder(model.emulator, np.zeros((1, model.scene.dim)), torch.float64).gravity(gravity)
-        pull = tuple((stated[0] / model.scene.dt**2).tolist()) if model.scene.gravity_varies else None
-    return scene_window(model, simulate_scene(preset, seed, 1, pull)).initial
+        stated = StateBuilder(emulator, np.zeros((1, scene.dim)), torch.float64).gravity(gravity)
+        pull = tuple((stated[0] / scene.dt**2).tolist()) if scene.gravity_varies else None
+    return scene_window(scene, simulate_scene(preset, seed, 1, pull)).initial

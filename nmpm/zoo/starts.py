@@ -186,7 +186,7 @@ def recorded_start(
     else:
         beside = path == recorded.path and (path.parent / METADATA_FILE).is_file()
         dataset = Dataset(FolderSource(path.parent if beside else path, facts))
-        match = match_data(model, dataset, materials, stride, strict)
+        match = match_data(model.emulator, model.name, dataset, materials, stride, strict)
         model, between = model.matched(match), match.reading.between
         scene = dataclasses.replace(dataset.scene, dt=dataset.scene.dt * match.reading.every)
         window = collate([SplitRecordings(recorded, metadata, match.reading)[index]], match.reading)

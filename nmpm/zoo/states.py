@@ -6,7 +6,7 @@ import dataclasses
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -29,10 +29,6 @@ from nmpm.errors import ConfigError, DataError
 from nmpm.obstacles import Body
 from nmpm.particles import Particles, thrown_blocks
 from nmpm.scene import Scene
-
-if TYPE_CHECKING:
-    from nmpm.zoo.pretrained import Pretrained
-
 
 Bodies = Sequence[Body] | Sequence[Sequence[Body]]
 """Obstacles of all scenes, or of each."""
@@ -338,50 +334,58 @@ _SAME_GRAVITY = 0.05
 """Share of the model's gravity by which that of data may differ, as it may be measured."""
 
 
-def thrown_state(model: Pretrained, seed: int, count: int, blocks: int | None, gravity: Any) -> Particles:
-    """Blocks of particles thrown into the scene's box, for a model; see `Pretrained.example`."""
-    blocks = len(model.scene.materials) if blocks is None else blocks
+def thrown_state(
+    emulator: Emulator, seed: int, count: int, blocks: int | None = None, gravity: Any = None
+) -> Particles:
+    """Blocks of particles thrown into the scene's box; see `Pretrained.example`."""
+    blocks = len(emulator.scene.materials) if blocks is None else blocks
     for name, value, least in (("seed", seed, 0), ("count", count, 1), ("blocks", blocks, 1)):
         check_whole(name, value, least)
     try:
-        state = thrown_blocks(model.scene, count=count, blocks=blocks, seed=seed)
+        state = thrown_blocks(emulator.scene, count=count, blocks=blocks, seed=seed)
     except ValueError as error:
         raise ConfigError(f"{error} Use fewer particles or more blocks.") from error
     if gravity is None:
-        return with_usual_gravity(model.emulator, state)
-    builder = StateBuilder(model.emulator, state.position, state.position.dtype)
+        return with_usual_gravity(emulator, state)
+    builder = StateBuilder(emulator, state.position, state.position.dtype)
     return dataclasses.replace(state, gravity=builder.gravity(gravity))
 
 
 def state_of(
-    model: Pretrained, trajectory: Trajectory, frame: int = 1, materials: Mapping[str, str] | None = None
+    emulator: Emulator,
+    trajectory: Trajectory,
+    frame: int = 1,
+    materials: Mapping[str, str] | None = None,
+    too_fast: float = TOO_FAST,
 ) -> Particles:
-    """The state of a trajectory at a frame, for a model; see `Pretrained.start`."""
-    metadata = _metadata(model, trajectory)
+    """The state of a trajectory at a frame; see `Pretrained.start`."""
+    scene = emulator.scene
+    metadata = _metadata(scene, trajectory)
     frames = len(trajectory.position)
     if not 1 <= frame < frames:
         raise ConfigError(f"frame = {frame} must be 1 … {frames - 1}: velocities need the frame before it.")
-    if metadata.dim != model.scene.dim:
-        raise DataError(f"The trajectory has {metadata.dim} axes, the model {model.scene.dim}.")
-    back = min(frame, max(1, round(model.scene.dt / metadata.dt)))
+    if metadata.dim != scene.dim:
+        raise DataError(f"The trajectory has {metadata.dim} axes, the model {scene.dim}.")
+    back = min(frame, max(1, round(scene.dt / metadata.dt)))
     steps = _steps(trajectory, metadata, frame, back)
     present, position = ~np.isnan(steps[1, :, 0]), trajectory.position[frame]
     types = trajectory.particle_type
     moving, obstacle = metadata.is_moving(types) & present, np.isin(types, list(metadata.obstacle_types)) & present
     if not moving.any():
         raise DataError(f"No particle that moves is there in frames {frame - back} and {frame} of the trajectory.")
-    state = model.state(
-        position[moving],
-        velocity=_velocity(model, trajectory, metadata, steps[:, moving], back),
-        material=_materials(model, metadata, types[moving], {**dict(model.scene.aliases), **(materials or {})}),
+    builder = StateBuilder(emulator, position[moving], None, too_fast)
+    state = builder.build(
+        velocity=_velocity(scene, trajectory, metadata, steps[:, moving], back),
+        material=_materials(scene, metadata, types[moving], {**dict(scene.aliases), **(materials or {})}),
         obstacle=position[obstacle] if obstacle.any() else None,
-        gravity=_gravity(model, trajectory, metadata),
-        fields=_fields(model, trajectory, frame, moving),
+        gravity=_gravity(scene, trajectory, metadata),
+        fields=_fields(scene, trajectory, frame, moving),
+        bodies=None,
         volume=relative_volumes(trajectory, moving),
-    )
-    if not model.scene.moving_obstacles or not obstacle.any():
+    ).to(emulator.device)
+    if not scene.moving_obstacles or not obstacle.any():
         return state
-    moved = torch.from_numpy(steps[1, obstacle] / (back * metadata.dt)).to(state.obstacle) * model.scene.dt
+    moved = torch.from_numpy(steps[1, obstacle] / (back * metadata.dt)).to(state.obstacle) * scene.dt
     return dataclasses.replace(state, obstacle_velocity=moved[None])
 
 
@@ -393,11 +397,9 @@ def _steps(trajectory: Trajectory, metadata: Metadata, frame: int, back: int) ->
     return np.stack([displacements(trajectory.position[first : frame - back + 1], metadata).sum(axis=0), last])
 
 
-def _velocity(
-    model: Pretrained, trajectory: Trajectory, metadata: Metadata, steps: np.ndarray, back: int
-) -> np.ndarray:
+def _velocity(scene: Scene, trajectory: Trajectory, metadata: Metadata, steps: np.ndarray, back: int) -> np.ndarray:
     """(N, D) velocity in length per second, that between the last two frames of the model, of (2, N, D) `_steps`."""
-    ratio = model.scene.dt / (back * metadata.dt)
+    ratio = scene.dt / (back * metadata.dt)
     ratio = 1.0 if math.isclose(ratio, 1.0, rel_tol=1e-3) else ratio
     pull = trajectory_gravity(trajectory.attributes, metadata, "the trajectory") or (0.0,) * metadata.dim
     before, last = map(torch.from_numpy, steps)
@@ -405,11 +407,11 @@ def _velocity(
     return model_velocity(last, last - before, gravity, ratio).numpy() / (ratio * back * metadata.dt)
 
 
-def _metadata(model: Pretrained, trajectory: Trajectory) -> Metadata:
+def _metadata(scene: Scene, trajectory: Trajectory) -> Metadata:
     """The trajectory's; without, all particles are the model's only material."""
     if trajectory.metadata is not None:
         return trajectory.metadata
-    scene, kinds = model.scene, np.unique(trajectory.particle_type)
+    kinds = np.unique(trajectory.particle_type)
     if len(scene.materials) > 1 or len(kinds) > 1:
         raise DataError(
             f"The trajectory does not say what its particle types {kinds.tolist()} are. Take it from"
@@ -425,11 +427,11 @@ def _metadata(model: Pretrained, trajectory: Trajectory) -> Metadata:
     )
 
 
-def _materials(model: Pretrained, metadata: Metadata, types: np.ndarray, renamed: Mapping[str, str]) -> list[str]:
+def _materials(scene: Scene, metadata: Metadata, types: np.ndarray, renamed: Mapping[str, str]) -> list[str]:
     """Names of the particles' materials, of the model's."""
     ids = np.unique(types).tolist()
     names = {i: renamed.get(metadata.particle_types[i], metadata.particle_types[i]) for i in ids}
-    theirs = model.scene.materials
+    theirs = scene.materials
     unknown = sorted({name for name in names.values() if name not in theirs})
     if unknown:
         raise DataError(
@@ -439,9 +441,9 @@ def _materials(model: Pretrained, metadata: Metadata, types: np.ndarray, renamed
     return [names[i] for i in types.tolist()]
 
 
-def _gravity(model: Pretrained, trajectory: Trajectory, metadata: Metadata) -> Any:
+def _gravity(scene: Scene, trajectory: Trajectory, metadata: Metadata) -> Any:
     """The trajectory's gravity where the model needs one, or knows another than this."""
-    scene, gravity = model.scene, trajectory_gravity(trajectory.attributes, metadata, "the trajectory")
+    gravity = trajectory_gravity(trajectory.attributes, metadata, "the trajectory")
     if scene.gravity_varies or gravity is None or scene.gravity is None:
         return gravity if scene.gravity_varies else None
     return None if is_gravity_of(scene, gravity) else gravity
@@ -453,11 +455,11 @@ def is_gravity_of(scene: Scene, gravity: Sequence[float]) -> bool:
     return np.allclose(gravity, stated, rtol=0, atol=_SAME_GRAVITY * float(np.abs(stated).max()))
 
 
-def _fields(model: Pretrained, trajectory: Trajectory, frame: int, moving: np.ndarray) -> dict[str, Any]:
+def _fields(scene: Scene, trajectory: Trajectory, frame: int, moving: np.ndarray) -> dict[str, Any]:
     """Fields of the model's scene that the trajectory has, at a frame."""
     frames, particles = trajectory.position.shape[:2]
     fields: dict[str, Any] = {}
-    for name in model.scene.fields:
+    for name in scene.fields:
         values = trajectory.fields.get(name, trajectory.attributes.get(name))
         if values is None:
             continue

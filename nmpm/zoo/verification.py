@@ -162,7 +162,7 @@ def golden_rollout(emulator: Emulator) -> dict[str, Any]:
     Of the first scenes it is the one that deforms the block most: what flies freely would hardly show that a network's
     output has changed.
     """
-    count = fitting_count(Pretrained(emulator, {}), COUNT, blocks=1)
+    count = fitting_count(emulator, COUNT, blocks=1)
     paths = [_positions(emulator, seed, count, FRAMES) for seed in range(SEEDS)]
     deformation = []
     for seed, last in enumerate(paths):

@@ -111,9 +111,9 @@ def test_an_example_has_a_block_of_each_material():
 def test_a_golden_rollout_of_one_block_fits_where_blocks_of_each_material_do():
     flat = ((0.1, 0.9), (0.1, 0.32))  # 11 particles high
     mixed = model_of(box(materials=("water", "sand", "goop"), bounds=flat))
-    assert fitting_count(mixed, 300) > fitting_count(mixed, 300, blocks=1)
+    assert fitting_count(mixed.emulator, 300) > fitting_count(mixed.emulator, 300, blocks=1)
     golden = golden_rollout(mixed.emulator)
-    assert golden["count"] == fitting_count(mixed, 300, blocks=1)
+    assert golden["count"] == fitting_count(mixed.emulator, 300, blocks=1)
     assert golden_distance(mixed, golden) == 0
 
 

@@ -39,11 +39,11 @@ def test_gravity_of_an_example_is_drawn_or_stated():
 
 def test_models_of_other_scenes_than_a_preset_get_thrown_blocks():
     goop = Zoo.load("goop")
-    assert training_preset(goop).name == "goop"
+    assert training_preset(goop.scene, goop.preset).name == "goop"
     recorded = dataclasses.replace(goop, card=goop.card | {"dataset": "deepmind-goop"})
     wide = goop.over(dataclasses.replace(goop.scene, bounds=((0.1, 1.9), (0.1, 0.9)), domain=((0, 2), (0, 1))))
     for model in (recorded, wide):
-        assert training_preset(model) is None
+        assert training_preset(model.scene, model.preset) is None
         thrown = model.example(seed=2)
         torch.testing.assert_close(thrown.position, model.example(seed=2, count=1000).position)
     assert goop.example(blocks=4).position.shape == goop.example(count=1000, blocks=4).position.shape

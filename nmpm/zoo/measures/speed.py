@@ -58,7 +58,7 @@ def thrown_scene(model: Pretrained) -> Particles:
     stated = model.card.get("particles", PARTICLES)
     if not isinstance(stated, int) or isinstance(stated, bool) or stated < 1:
         raise ZooError(f"{model.name}: particles of its card should be their number, not {one_line(repr(stated), 60)}.")
-    return model.example(count=fitting_count(model, stated)).to(model.emulator.device)
+    return model.example(count=fitting_count(model.emulator, stated)).to(model.emulator.device)
 
 
 def repeat_scene(state: Particles, batch: int) -> Particles:
