@@ -352,5 +352,5 @@ def number_order(path: Path) -> tuple[list[int], str]:
 
 def find_split_name(*words: str) -> str | None:
     """The split that one of some words means, such as "val" or "training"; None if none does."""
-    lower = [word.lower() for word in words]
-    return next((split for split in SPLITS if {split, *OTHER_NAMES[split]} & set(lower)), None)
+    lower = {word.lower() for word in words}
+    return next((split for split in SPLITS if not lower.isdisjoint({split, *OTHER_NAMES[split]})), None)

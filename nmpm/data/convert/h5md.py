@@ -73,16 +73,12 @@ class _Group:
         shape = self._position.values.shape
         if len(shape) != 3 or not 1 <= shape[2] <= 3:
             raise DataError(f"{where}/position/value: its shape is {tuple(shape)}, not frames, particles, 1 to 3 axes.")
+        self.count = shape[0]  # of frames
         edges = self._box.get("edges") if isinstance(self._box, h5py.Group) else None
         self._edges = None if edges is None else _Element.of(edges, f"{where}/box/edges")
         self._low = 0.0
         if self.count and self._edges is not None and (self._position.row(0) < 0).any():
             self._low = -0.5  # of the edges: HALMD's boxes are about the origin
-
-    @property
-    def count(self) -> int:
-        """Number of frames."""
-        return len(self._position.values)
 
     def frame(self, index: int) -> Frame:
         """The particles of a frame."""

@@ -140,7 +140,14 @@ def describe_unknown(path: Path) -> str:
     if suffix in HINTS:
         return f"{first}: {suffix} files are not read: {HINTS[suffix]}. {_PAGE}"
     if any(first.match(pattern) for pattern in ArrayFiles.patterns):
-        return f"{first}: {_array_problem(first)} {_PAGE}"
+        try:
+            with open_arrays(first) as arrays:
+                candidates = {name: array for name, array in arrays.items() if can_be_positions(array)}
+                problem = f"which array are the positions? Call it position ({describe(candidates)})."
+                problem = problem if len(candidates) > 1 else _wrong_positions(arrays, first.suffix)
+        except NmpmError as error:
+            problem = str(error).removeprefix(f"{first}: ")
+        return f"{first}: {problem} {_PAGE}"
     if any(first.match(pattern) for pattern in SUFFIXES):
         try:
             table_columns(first)
@@ -158,18 +165,6 @@ def describe_several(path: Path, datasets: Sequence[Path]) -> str:
     more = f" and {len(datasets) - 8} more" if len(datasets) > 8 else ""
     several = f"several datasets, {names}{more}" if len(datasets) > 1 else f"a dataset, {names}"
     return f"{path}: the folder is not one dataset but holds {several}: name one of them, e.g. {datasets[0]}."
-
-
-def _array_problem(file: Path) -> str:
-    """What is wrong with the arrays of a file, and what is wanted."""
-    try:
-        with open_arrays(file) as arrays:
-            candidates = {name: array for name, array in arrays.items() if can_be_positions(array)}
-            if len(candidates) > 1:
-                return f"which array are the positions? Call it position ({describe(candidates)})."
-            return _wrong_positions(arrays, file.suffix)
-    except NmpmError as error:
-        return str(error).removeprefix(f"{file}: ")
 
 
 def _wrong_positions(arrays: Arrays, suffix: str) -> str:

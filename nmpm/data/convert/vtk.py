@@ -143,13 +143,19 @@ def read_points(path: Path) -> dict[str, Any]:
         if len(array) != len(position):
             raise DataError(f"{path}: {one_line(name, 40)} has {len(array)} values for {len(position)} points.")
     left_out = [] if fit else [f"{name} of cells" for name in cell_arrays]
+    time = None  # that the field data state
+    for index in range(output.GetFieldData().GetNumberOfArrays()):
+        array = output.GetFieldData().GetArray(index)
+        if array is not None and _text(array.GetName()).lower() in _TIMES and array.GetNumberOfValues() == 1:
+            time = float(array.GetTuple1(0))
+            break
     kinds = vtkCellTypes()
     output.GetCellTypes(kinds)
     faces = {kinds.GetCellType(index) for index in range(kinds.GetNumberOfTypes())} - {VTK_POLY_VERTEX, VTK_VERTEX}
     return {
         "position": position,
         "arrays": arrays,
-        "time": _time(output),
+        "time": time,
         "left_out": left_out,
         "surface": bool(faces),
     }
@@ -171,16 +177,6 @@ def _arrays(data: Any, convert: Any) -> dict[str, np.ndarray]:
         elif array.IsA("vtkStringArray"):
             arrays[name] = np.array([_text(array.GetValue(i)) for i in range(array.GetNumberOfValues())], dtype=str)
     return arrays
-
-
-def _time(output: Any) -> float | None:
-    """The time that the field data state."""
-    data = output.GetFieldData()
-    for index in range(data.GetNumberOfArrays()):
-        array = data.GetArray(index)
-        if array is not None and _text(array.GetName()).lower() in _TIMES and array.GetNumberOfValues() == 1:
-            return float(array.GetTuple1(0))
-    return None
 
 
 def _kind_error(path: Path, kind: str) -> DataError:

@@ -136,21 +136,14 @@ def _write_block(group: Any, block: _Block, times: np.ndarray) -> None:
     _map(group, "Points", position, 2, dim)
     data, offsets = group.create_group("PointData"), steps.create_group("PointDataOffsets")
     for name, values in block.trajectory.items():
-        leading = _point_axes(name, values, frames, particles)
+        is_field = isinstance(values, h5py.Dataset) and name not in ("position", TRUTH, "time")
+        if not is_field or values.dtype.kind not in "iuf" or values.dtype.itemsize == 2 or not 1 <= values.ndim <= 3:
+            continue
+        by_point = values.shape[0] == particles and values.ndim < 3
+        leading = 2 if values.shape[:2] == (frames, particles) else int(by_point)  # axes (T, N, …), (N, …), or others
         if leading == 1 or (leading == 2 and block.position != TRUTH):  # other fields are those of the prediction
             _map(data, name, values, leading, dim)
             _write(offsets, name, frame * particles if leading == 2 else np.zeros(len(times)))
-
-
-def _point_axes(name: str, values: Any, frames: int, particles: int) -> int:
-    """Leading axes of a field that are those of points: 2 for (T, N, …), 1 for (N, …), 0 if it is not of points."""
-    if not isinstance(values, h5py.Dataset) or name in ("position", TRUTH, "time"):
-        return 0
-    if values.dtype.kind not in "iuf" or values.dtype.itemsize == 2 or not 1 <= values.ndim <= 3:
-        return 0
-    if values.shape[:2] == (frames, particles):
-        return 2
-    return int(values.shape[0] == particles and values.ndim < 3)
 
 
 def _write(group: Any, name: str, values: np.ndarray) -> None:
