@@ -107,6 +107,28 @@ def test_ids_may_be_texts(tmp_path, name):
 
 
 @pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        *((name, kind) for name in ("run.npz", "run.h5", "npy") for kind in ("M8[us]", "U32", "S32")),
+        *((name, "U32") for name in ("tracks.csv", "tracks.parquet", "csv_frames")),
+    ],
+)
+@pytest.mark.parametrize("zone", ["", "Z", "+02:00"])
+def test_dates_are_seconds_since_the_first(tmp_path, name, kind, zone):
+    if kind == "M8[us]" and (zone or name == "run.h5"):
+        return  # NumPy's dates have no zone, HDF5 has no dates
+    moments = np.datetime64("2026-05-31T23:59:59.995", "ms") + np.arange(T)
+    texts = [f"{moment}{zone}".replace("T", " ") for moment in moments]
+    time = moments.astype(kind) if kind == "M8[us]" else np.array(texts, kind)
+    time = time.astype(object) if name == "run.h5" and kind == "U32" else time
+    in_rows = name in ("tracks.csv", "tracks.parquet", "csv_frames")
+    stored = np.broadcast_to(time[:, None], (T, N)) if in_rows else time
+    run = read(WRITERS[name](tmp_path / name, made(), {"time": stored}))
+    np.testing.assert_allclose(run.fields["time"], np.arange(T) / 1000, atol=1e-12)
+    np.testing.assert_allclose(run.position, made(), atol=1e-6)
+
+
+@pytest.mark.parametrize(
     ("name", "module", "package", "extra"),
     [
         ("vtk", "vtkmodules", "pyvista", "vtk"), ("ply", "plyfile", "plyfile", "vtk"), ("gsd", "gsd", "gsd", "gsd"),

@@ -242,21 +242,6 @@ def test_a_sample_of_taichi_is_read(recorded):
         np.testing.assert_array_equal(read(path, "test").position, content["positions"][7])
 
 
-@pytest.mark.parametrize("kind", ["M8[us]", "U32", "S32"])
-@pytest.mark.parametrize("suffix", [".npz", ".h5"])
-def test_dates_are_seconds_since_the_first(tmp_path, kind, suffix):
-    moments, path = np.datetime64("2026-05-31T23:59:59.995") + np.arange(FRAMES) * np.timedelta64(1, "ms"), None
-    if suffix == ".h5" and kind == "M8[us]":
-        return  # HDF5 has no dates
-    path, time = tmp_path / f"a{suffix}", moments.astype(kind)
-    if suffix == ".npz":
-        np.savez(path, position=made(), time=time)
-    else:
-        with h5py.File(path, "w") as file:
-            file["position"], file["time"] = made(), time.astype(object if kind == "U32" else kind)
-    np.testing.assert_allclose(read(path).fields["time"], np.arange(FRAMES) / 1000, atol=1e-12)
-
-
 def test_texts_in_archives_are_types_or_left_out_or_refused_with_the_mend(tmp_path):
     names = np.array(["sand", "clay", "sand", "clay", "clay"])
     np.savez(tmp_path / "a.npz", position=made(), types=names[:, None], units="mm", dt="0.1 s")

@@ -187,26 +187,6 @@ def test_tables_as_spreadsheets_save_them(tmp_path, encoding, name, separator):
     np.testing.assert_allclose(read(tmp_path / name).position, position, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["a.csv", "a.parquet", "folder"])
-@pytest.mark.parametrize("zone", ["", "Z", "+02:00"])
-def test_dates_are_seconds_since_the_first(tmp_path, name, zone):
-    position, moments = made(), [f"2026-05-31 23:59:59.{9 - 1:01d}{frame:02d}{zone}" for frame in range(FRAMES)]
-    rows = [row.split(",") for row in lines(position)[1:]]
-    if name == "folder":
-        for frame in range(FRAMES):
-            inside = [",".join([moments[frame], *row[1:]]) for row in rows if int(row[0]) == frame]
-            path = write(tmp_path / name / f"f_{frame}.csv", ["time,particle,x,y", *inside]).parent
-    else:
-        path = write(tmp_path / "a.csv", ["time,particle,x,y", *(",".join([moments[int(r[0])], *r[1:]]) for r in rows)])
-    if name == "a.parquet":
-        table, parquet = pytest.importorskip("pyarrow.csv"), pytest.importorskip("pyarrow.parquet")
-        parquet.write_table(table.read_csv(path), tmp_path / name)
-        path = tmp_path / name
-    run = read(path)
-    np.testing.assert_allclose(run.fields["time"], np.arange(FRAMES) / 1000, atol=1e-12)
-    np.testing.assert_allclose(run.position, position, atol=1e-6)
-
-
 def test_other_dates_and_commas_are_refused_with_the_mend(tmp_path):
     rows = ["time,id,x,y", "31.05.2026 12:00,1,0.5,0.5"]
     with pytest.raises(DataError, match=r"column time must contain numbers, or dates such as 2026-05-31T12.*'31\.05\."):

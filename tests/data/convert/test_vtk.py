@@ -1,6 +1,7 @@
 """Files that vtk writes, by pyvista, and PLY files that plyfile writes."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -91,25 +92,16 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
-def replace_by_grid(path: Path) -> None:
-    pyvista.ImageData(dimensions=(2, 2, 2)).save(path)
+def swap(*pairs: tuple[bytes, bytes]) -> Callable[[Path], None]:
+    def change(path: Path) -> None:
+        for old, new in pairs:
+            path.write_bytes(path.read_bytes().replace(old, new))
+
+    return change
 
 
-def declare_more(path: Path) -> None:
-    for few, many in (
-        (b"POINTS 7", b"POINTS 700000000"),
-        (b'OfPoints="7"', b'OfPoints="700000000"'),
-        (b"vertex 7", b"vertex 7000000000"),
-    ):
-        path.write_bytes(path.read_bytes().replace(few, many))
-
-
-def rename_axes(path: Path) -> None:
-    path.write_bytes(path.read_bytes().replace(b"float x", b"float q").replace(b"float y", b"float r"))
-
-
-def declare_fewer_than_none(path: Path) -> None:
-    path.write_bytes(path.read_bytes().replace(b'OfPoints="7"', b'OfPoints="-7"'))
+declare_more = swap((b"POINTS 7", b"POINTS 700000000"), (b'OfPoints="7"', b'OfPoints="700000000"'),
+                    (b"vertex 7", b"vertex 7000000000"))  # fmt: skip
 
 
 @pytest.mark.parametrize("content", ["[1", "[]", '{"files": [1]}', '{"files": [{"name": "a.vtp", "time": "x"}]}'])
@@ -125,12 +117,16 @@ def test_a_series_that_is_none_is_named(tmp_path, content):
         (".vtp", cut, r"cannot be read as VTK \(.*\). Is it complete\?"),
         (".vtk", cut, r"cannot be read as VTK \(.*\). Is it complete\?"),
         (".vtu", lambda path: path.write_bytes(b""), r"cannot be read as VTK \(.*\). Is it complete\?"),
-        (".vtk", replace_by_grid, "it has a StructuredPoints; particles are points"),
+        (".vtk", pyvista.ImageData(dimensions=(2, 2, 2)).save, "it has a StructuredPoints; particles are points"),
         (".vtk", declare_more, "it declares 700,000,000 points or cells but has"),
         (".vtp", declare_more, "it declares 700,000,000 points or cells but has"),
-        (".vtu", declare_fewer_than_none, "it declares -7 points or cells but has"),
+        (".vtu", swap((b'OfPoints="7"', b'OfPoints="-7"')), "it declares -7 points or cells but has"),
         (".ply", cut, r"cannot be read as PLY \(.*early end-of-file"),
-        (".ply", rename_axes, r"it has no element vertex with x, y \(found: vertex, q, r, z"),
+        (
+            ".ply",
+            swap((b"float x", b"float q"), (b"float y", b"float r")),
+            r"it has no element vertex with x, y \(found: vertex, q, r, z",
+        ),
         (".ply", declare_more, "cannot be read as PLY"),
         (".ply", lambda path: path.write_bytes(b""), "cannot be read as PLY "),
     ],
