@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import platform
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -120,22 +121,14 @@ def check_fits(frames: int, particles: int, values: int, where: str) -> None:
 
 def free_memory() -> float:
     """Bytes of main memory that are free, within the container's limit; infinite where the system does not say."""
-    return min(_available(), _left_in_container())
-
-
-def _available() -> float:
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-    except OSError:
-        return math.inf
-    sizes = {name: value for name, _, value in (line.partition(":") for line in lines)}
-    return 1024.0 * float(sizes["MemAvailable"].split()[0]) if "MemAvailable" in sizes else math.inf
-
-
-def _left_in_container() -> float:
-    try:
+    free = [math.inf]
+    with suppress(OSError):
+        sizes = dict(line.partition(":")[::2] for line in Path("/proc/meminfo").read_text().splitlines())
+        if "MemAvailable" in sizes:
+            free.append(1024.0 * float(sizes["MemAvailable"].split()[0]))
+    with suppress(OSError):
         limit, used = ((_CGROUP / f"memory.{name}").read_text().strip() for name in ("max", "current"))
         cached = dict(line.split() for line in (_CGROUP / "memory.stat").read_text().splitlines())
-    except OSError:
-        return math.inf
-    return math.inf if limit == "max" else float(limit) - float(used) + float(cached.get("inactive_file", 0))
+        if limit != "max":
+            free.append(float(limit) - float(used) + float(cached.get("inactive_file", 0)))
+    return min(free)

@@ -119,15 +119,11 @@ def sections(kind: type) -> tuple[str, dict[str, str], str]:
     """The description, the texts about arguments, and the examples of a class's docstring."""
     text = inspect.cleandoc(kind.__doc__ or "")
     parts = re.split(r"^([A-Z][a-z]+):\n(?= )", text, flags=re.MULTILINE)
-    indented = ["\n".join(takewhile(_is_indented, part.splitlines())) for part in parts[2::2]]
+    indented = ["\n".join(takewhile(lambda line: line[:1] in ("", " "), part.splitlines())) for part in parts[2::2]]
     named = dict(zip(parts[1::2], map(textwrap.dedent, indented), strict=True))
     entries = re.split(r"\n(?=\w+: )", named.get("Args", "").strip("\n"))
     texts = [entry.partition(": ") for entry in entries]
     return parts[0].strip(), {name: " ".join(text.split()) for name, _, text in texts}, named.get("Examples", "")
-
-
-def _is_indented(line: str) -> bool:
-    return not line or line.startswith(" ")
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
@@ -168,8 +164,12 @@ def command_parser(kind: type[Command], prog: str) -> CommandParser:
     values = kind.help_values()
     if values:
         description, examples = description.format(**values), examples.format(**values)
+    # Calls are indented below their heading, prose between them is not.
+    paragraphs = re.split(r"\n{2,}", examples.strip("\n"))
+    shown = "\n\n".join(textwrap.indent(one, "  ") if one.startswith("nmpm ") else one for one in paragraphs)
+    epilog = f"examples:\n{shown}" if examples else ""
     parser = CommandParser(
-        prog=prog, description=description, epilog=_epilog(examples), formatter_class=HelpFormatter, allow_abbrev=True
+        prog=prog, description=description, epilog=epilog, formatter_class=HelpFormatter, allow_abbrev=True
     )
     hints, texts = get_type_hints(kind), argument_texts(kind)
     groups: dict[str, Any] = {"options": parser}
@@ -203,13 +203,6 @@ def run_command(kind: type[Command], prog: str, words: Sequence[str]) -> int | N
             hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(kind.commands)}."
             raise UsageError(f"there is no command {one_line(repr(unknown), 60)}; {hint} See {prog} --help.")
     return kind.run_words(prog, words)
-
-
-def _epilog(examples: str) -> str:
-    """Calls, indented, below their heading; prose between them as it is."""
-    paragraphs = re.split(r"\n{2,}", examples.strip("\n"))
-    shown = [textwrap.indent(one, "  ") if one.startswith("nmpm ") else one for one in paragraphs]
-    return "examples:\n" + "\n\n".join(shown) if examples else ""
 
 
 def _by_class(kind: type[Command]) -> Iterator[tuple[str, list[Field[Any]]]]:

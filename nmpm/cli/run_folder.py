@@ -141,15 +141,8 @@ def next_folder(root: Path) -> tuple[Path, str]:
     while folder.results():
         former.append(folder)
         folder = RunFolder.of(root / f"version_{len(former)}", {})
-    return folder.root, _describe(former)
-
-
-def _describe(runs: list[RunFolder]) -> str:
-    """A line about earlier runs: the last that can go on, with the command; empty without runs."""
-    if not runs:
-        return ""
-    unfinished = [run.root for run in runs if run.unfinished]
+    unfinished = [run.root for run in former if run.unfinished]
     if not unfinished:
-        return f"{runs[-1].root} holds a run; this is a new one.\n"
-    command = shlex.join(["nmpm", "fit", "--resume", str(unfinished[-1])])
-    return f"{unfinished[-1]} holds an unfinished run, with which {command} goes on; this is a new one.\n"
+        return folder.root, f"{former[-1].root} holds a run; this is a new one.\n" if former else ""
+    last, command = unfinished[-1], shlex.join(["nmpm", "fit", "--resume", str(unfinished[-1])])
+    return folder.root, f"{last} holds an unfinished run, with which {command} goes on; this is a new one.\n"

@@ -87,7 +87,12 @@ class Simulate(Command):
 
     def _simulate(self, name: str) -> None:
         if self.preview is not None:
-            _check_preview(self.preview)
+            from nmpm.data.write import find_writer, is_written_by_suffix
+
+            if is_written_by_suffix(self.preview):
+                find_writer("--preview", self.preview)
+            else:
+                check_picture("--preview", self.preview)
         from nmpm.data import catalog
         from nmpm.data.simulation import Shard, generate
         from nmpm.sim import load_preset, preset_names
@@ -108,16 +113,6 @@ class Simulate(Command):
             return
         sys.stdout.write(f"wrote {', '.join(f'{n} {s}' for s, n in counts.items() if n)} trajectories to {out}\n")
         sys.stdout.write(f"to look at them: nmpm inspect {shlex.quote(str(out))}\n")
-
-
-def _check_preview(path: Path) -> None:
-    """Raise ConfigError, before the work, if a preview cannot be written."""
-    from nmpm.data.write import find_writer, is_written_by_suffix
-
-    if is_written_by_suffix(path):
-        find_writer("--preview", path)
-    else:
-        check_picture("--preview", path)
 
 
 def _list() -> None:

@@ -271,14 +271,15 @@ def _configs(options: Sequence[Option]) -> list[Mapping[str, Any]]:
     return [read_config(Path(value)) for name, value in options if name == "--config" and value]
 
 
-def _section(config: Mapping[str, Any], name: str) -> Mapping[str, Any]:
-    return section if isinstance(section := config.get(name), Mapping) else {}
+def _keys(configs: Sequence[Mapping[str, Any]], section: str) -> list[str]:
+    """The keys of a section of configurations."""
+    return [str(key) for config in configs if isinstance(keys := config.get(section), Mapping) for key in keys]
 
 
 def stated_keys(options: Sequence[Option], section: str) -> set[str]:
     """Arguments behind --model.… or --data.… that options, or configurations that they name, state."""
     given = {name.split(".")[1] for name, _ in options if name.startswith(f"--{section}.")}
-    return given.union(*(map(str, _section(config, section)) for config in _configs(options)))
+    return given.union(_keys(_configs(options), section))
 
 
 def check_options(options: Sequence[Option]) -> None:
@@ -289,8 +290,9 @@ def check_options(options: Sequence[Option]) -> None:
         ConfigError, DataError, ZooError: if dataset, checkpoint or the model to start from do not exist.
     """
     configs = _configs(options)
-    for section, names in ((name, known_options()[name]) for name in _SECTIONS):
-        for key in (key for config in configs for key in _section(config, section)):
+    for section in _SECTIONS:
+        names = known_options()[section]
+        for key in _keys(configs, section):
             if names and key not in (*names, "class_path", "init_args"):
                 wrong, all_names = f"{section}.{key}", [f"{section}.{name}" for name in names]
                 hint = nearest(wrong, all_names, known_options()["parts"], "")

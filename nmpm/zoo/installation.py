@@ -69,7 +69,9 @@ def _version(package: str) -> str | None:
 def processor() -> Iterator[Fact]:
     """Instructions, cores, name, and threads that may be used."""
     yield "instructions", ", ".join(instructions()) or "not stated by the system"
-    yield "cores", f"{usable_cores()} usable of {os.cpu_count()}; quota of the container: {_quota()}"
+    quotas = [path.read_text().strip() for name in QUOTAS if (path := Path("/sys/fs/cgroup") / name).is_file()]
+    quota = "none" if not quotas or quotas[0].startswith(("max", "-1")) else quotas[0]
+    yield "cores", f"{usable_cores()} usable of {os.cpu_count()}; quota of the container: {quota}"
     yield "load", f"{os.getloadavg()[0]:.1f} processes compete for the cores; above their number, times suffer"
     import torch
 
@@ -90,15 +92,6 @@ def instructions() -> list[str]:
         return []
     flags = {flag for line in lines if line.startswith(("flags", "Features")) for flag in line.split()}
     return [name for name, words in INSTRUCTIONS.items() if flags.intersection(words)]
-
-
-def _quota() -> str:
-    for name in QUOTAS:
-        path = Path("/sys/fs/cgroup") / name
-        if path.is_file():
-            text = path.read_text().strip()
-            return "none" if text.startswith(("max", "-1")) else text
-    return "none"
 
 
 def memory() -> Iterator[Fact]:
