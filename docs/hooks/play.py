@@ -54,20 +54,16 @@ def page_files(runtime: str) -> dict[str, str | bytes]:
 def described(model: Pretrained, runtime: str) -> dict[str, Any]:
     """What the page's scripts read of the scene, its start and the runtime."""
     state, limits = model.example(SEED), Limits(model)
-    fastest = float(limits.fastest.amin())
+    limits.most_particles = MOST
     return describe_played(
-        model.scene,
-        f"{MODEL} in your browser",
-        state.obstacle[0].numpy(),
-        model=MODEL,
+        model,
+        limits,
+        state.obstacle,
+        title=f"{MODEL} in your browser",
         tools=("throw",),
         playing=True,
         pace=PACE,
         beside=False,
-        most=MOST,
-        limits=[fastest],
-        fastest=0.3 * fastest * model.scene.dt,
-        bundle=model.emulator.frames,
         start={"position": _base64(state.position), "velocity": _base64(state.velocity)},
         runtime={"folder": runtime, "files": RUNTIME},
         invitation=f"Start (loads ONNX Runtime, 14 MB, from {urlsplit(runtime).hostname or 'this site'})",

@@ -12,14 +12,19 @@ import dataclasses
 import json
 import struct
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from nmpm.obstacles import Body
+from nmpm.play.limits import Limits
 from nmpm.scene import Scene
 from nmpm.viz.page import describe_scene, quantize
+
+if TYPE_CHECKING:
+    from nmpm.zoo import Pretrained
 
 EMULATOR, SIMULATOR, MATERIALS = 0, 1, 2
 
@@ -45,8 +50,9 @@ def describe_bodies(bodies: Mapping[int, Body]) -> str:
     return json.dumps({"bodies": described})
 
 
-def describe_played(scene: Scene, title: str, static: NDArray[Any], **facts: Any) -> dict[str, Any]:
-    """What the page's scripts read of a scene with static obstacles (M, D), and further facts."""
+def describe_played(model: Pretrained, limits: Limits, static: Tensor, *, title: str, **facts: Any) -> dict[str, Any]:
+    """What the page's scripts read of a model's scene with static obstacles (1, M, D), and further facts."""
+    scene = model.scene
     low, high = np.array(scene.domain).T
     return describe_scene(
         title=title,
@@ -57,8 +63,13 @@ def describe_played(scene: Scene, title: str, static: NDArray[Any], **facts: Any
         dt=scene.dt,
         spacing=scene.particle_spacing,
         materials=scene.materials,
-        obstacles=static,
+        obstacles=static[0].numpy(),
         low=low,
         high=high,
+        model=model.name,
+        bundle=model.emulator.frames,
+        most=limits.most_particles,
+        limits=limits.fastest.amin(dim=1).tolist(),
+        fastest=0.3 * float(limits.fastest.amin()) * scene.dt,
         **facts,
     )

@@ -29,8 +29,7 @@ from nmpm.obstacles import Disc, Ramp
 from nmpm.play import pictures
 from nmpm.play.beside import SimulatorBeside
 from nmpm.play.limits import Limits
-from nmpm.play.placing import Jet, Pour, block, with_room
-from nmpm.play.pushing import ANGLE, Movable, moved, new_body, push
+from nmpm.play.placing import ANGLE, Jet, Movable, Pour, block, moved, new_body, push, with_room
 from nmpm.play.recording import Recording, free_name
 from nmpm.play.world import World, first_frame, simulator_of
 from nmpm.zoo.states import StateBuilder
@@ -84,23 +83,20 @@ class Session:
     def greet(self) -> list[Message]:
         """What a page needs that has just been opened; what another one has not seen is forgotten."""
         self._seen, self._outbox = self._picture, []
-        facts = {
-            "model": self.model.name,
-            "seed": self.seed,
-            "most": self.limits.most_particles,
-            "limits": self.limits.fastest.amin(dim=1).tolist(),
-            "fastest": 0.3 * float(self.limits.fastest.amin()) * self.scene.dt,
-            "obstaclesMove": self.scene.obstacles and self.scene.dim == 2,
-            "gravityTurns": self.scene.gravity_varies,
-            "simulator": None if self._preset is None else self._preset.generator,
-            "bundle": self.model.emulator.frames,
-            "tools": ("throw", "pour", "look")[: self.scene.dim],
-            "playing": self.playing,
-            "pace": self.pace,
-            "beside": self._beside is not None,
-        }
-        static = self.world.static.numpy()
-        described = pictures.describe_played(self.scene, f"nmpm play · {self.model.name}", static, **facts)
+        described = pictures.describe_played(
+            self.model,
+            self.limits,
+            self.world.static,
+            title=f"nmpm play · {self.model.name}",
+            seed=self.seed,
+            obstaclesMove=self.scene.obstacles and self.scene.dim == 2,
+            gravityTurns=self.scene.gravity_varies,
+            simulator=None if self._preset is None else self._preset.generator,
+            tools=("throw", "pour", "look")[: self.scene.dim],
+            playing=self.playing,
+            pace=self.pace,
+            beside=self._beside is not None,
+        )
         self._show_all()
         return [json.dumps({"scene": described}), *self._sent()]
 

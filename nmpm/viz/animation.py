@@ -23,7 +23,7 @@ from nmpm.colours import BACKGROUND, FAINT_TEXT, INTERIOR, OBSTACLE, TEXT, WALL,
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import fit_camera
 from nmpm.viz.charts import ChartStrip
-from nmpm.viz.occupancy import band_colours, ensemble_colour
+from nmpm.viz.ensembles import band_colours, ensemble_colour
 from nmpm.viz.output import check_output, replace_picture
 from nmpm.viz.panel import PanelRenderer, format_time
 from nmpm.viz.trajectories import LabelledTrajectories

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from nmpm.colours import TEXT, hex_code
-from nmpm.viz.occupancy import LEVELS, band_colours, ensemble_colour
-from nmpm.viz.quantities import BANDS, QuantityCurves, quantity_curves
+from nmpm.viz.ensembles import BANDS, LEVELS, QuantityCurves, band_colours, ensemble_colour, quantity_curves
 from nmpm.viz.trajectories import LabelledTrajectories
 
 TRUTH_LINE: dict[str, Any] = {"color": hex_code(TEXT), "lw": 1.2, "ls": (0, (4, 1.5))}

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw
 
 from nmpm.colours import BACKGROUND, EDGE, INTERIOR, OBSTACLE, TEXT, WALL, material_colours
 from nmpm.viz.camera import Camera, box_corners, fit_camera, vertical_axis
-from nmpm.viz.occupancy import CELL, LEVELS, band_colours, occupied_share
+from nmpm.viz.ensembles import CELL, LEVELS, band_colours, occupied_share
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
 SUPERSAMPLING = 3

@@ -16,9 +16,9 @@ from nmpm.colours import FAINT_TEXT, TEXT, Rgb, hex_code, material_colours
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import fit_camera
 from nmpm.viz.charts import add_frame_axes, add_legend, draw_curves, legend_of_bands, legend_of_curves
+from nmpm.viz.ensembles import quantity_curves
 from nmpm.viz.output import check_output, replace_picture
 from nmpm.viz.panel import PanelRenderer, format_time
-from nmpm.viz.quantities import quantity_curves
 from nmpm.viz.trajectories import LabelledTrajectories
 
 DPI = 200

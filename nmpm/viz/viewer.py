@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from nmpm.colours import hex_code
 from nmpm.errors import ConfigError
 from nmpm.viz.camera import vertical_axis
-from nmpm.viz.occupancy import CELL, LEVELS, ensemble_colour
+from nmpm.viz.ensembles import CELL, LEVELS, ensemble_colour, quantity_curves
 from nmpm.viz.output import check_output, replace_picture
 from nmpm.viz.page import ABSENT, describe_scene, make_page, pack_bytes, pack_positions, quantize
 from nmpm.viz.panel import particle_spacing
-from nmpm.viz.quantities import quantity_curves
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
 __all__ = ["ViewerPage", "page_of_files", "view"]

@@ -14,9 +14,8 @@ from nmpm.metrics import quantities
 from nmpm.scene import Scene
 from nmpm.viz import LabelledTrajectories
 from nmpm.viz.animation import FrameRenderer
+from nmpm.viz.ensembles import front, kinetic_energy, mean_height, occupied_share, quantity_curves
 from nmpm.viz.files import combine, member_indices, read_labelled
-from nmpm.viz.occupancy import occupied_share
-from nmpm.viz.quantities import front, kinetic_energy, mean_height, quantity_curves
 from tests.made_up import made_up_metadata, made_up_trajectory
 
 

@@ -10,9 +10,8 @@ from PIL import Image
 
 from nmpm import view
 from nmpm.viz import LabelledTrajectories
-from nmpm.viz.occupancy import occupied_share
+from nmpm.viz.ensembles import front, occupied_share
 from nmpm.viz.page import bundle
-from nmpm.viz.quantities import front
 from tests.conftest import wait_until
 
 WATER = (38, 112, 200)

@@ -1,4 +1,4 @@
-// Where an ensemble's members are, in 2-D: the share of them that occupy each cell, as bands; see occupancy.py.
+// Where an ensemble's members are, in 2-D: the share of them that occupy each cell, as bands; see ensembles.py.
 
 import { bindTexture, compile, rectangle } from "./drawing.js";
 import { ABSENT, readColour, scene } from "./scene.js";

@@ -2,8 +2,7 @@
 
 import { Camera, panelRectangles, project } from "./camera.js";
 import { DISC_DIAMETER, Drawing, MODES } from "./drawing.js";
-import { colourLegend } from "./legend.js";
-import { element, make, readColour, scene } from "./scene.js";
+import { element, make, readColour, scaleEnds, scene } from "./scene.js";
 
 const THEME_COLOURS = ["page", "text", "faint", "line", "inside", "wall", "ghost", "accent"];
 const MOST_PIXELS = 2; // along each axis, to a pixel of the page: phones have 3, which nobody sees in discs
@@ -165,4 +164,26 @@ export class Page {
     this.drawing.drawFrame({ position: this.drawing.obstacles }, matrix, plain);
     this.drawContents(shown, matrix, { ...plain, mode: MODES[this.colour] ?? MODES.field });
   }
+}
+
+/** The legend of the materials, of speeds or errors, or of a field, by the value of the choice of colours. */
+function colourLegend(colour) {
+  const field = scene.fields[Number(colour.replace("field ", ""))];
+  if (colour === "material")
+    return scene.materials.map(({ name, colour: background }) => make("span", {}, make("i", { style: `background: ${background}` }), name));
+  if (field) return [scaleBar([field.low, (field.low + field.high) / 2, field.high], "")];
+  const end = colour === "speed" ? scene.fastest / scene.dt : scene.worst;
+  return [scaleBar([0, end / 4, end], colour === "speed" ? "length per second" : "length")]; // a square root: see drawing.js
+}
+
+/** The colour scale with numbers at its lower end, middle and upper end. */
+function scaleBar(numbers, unit) {
+  const bar = make("canvas", { width: scene.scale.length, height: 1 }), context = bar.getContext("2d");
+  const [from, to] = scaleEnds(), last = scene.scale.length - 1;
+  for (let at = 0; at <= last; at++) {
+    context.fillStyle = scene.scale[Math.round(from * last + (to - from) * at)];
+    context.fillRect(at, 0, 1, 1);
+  }
+  const texts = numbers.map((number) => make("small", {}, Number(number.toPrecision(2))));
+  return make("span", { className: "scale" }, bar, unit, ...texts);
 }

@@ -6,12 +6,8 @@ const fromBase64 = (text) => new Float32Array(Uint8Array.from(atob(text), (chara
 let ort, session, scene, state;
 
 async function read(url, integrity) {
-  let answer;
-  try {
-    answer = await fetch(url, integrity ? { integrity } : {});
-  } catch {
-    throw new Error(`${url} cannot be read, or is not the file that this page expects.`);
-  }
+  const answer = await fetch(url, integrity ? { integrity } : {}).catch(() => null);
+  if (!answer) throw new Error(`${url} cannot be read, or is not the file that this page expects.`);
   if (!answer.ok) throw new Error(`${url} cannot be read: ${answer.status}.`);
   return answer.arrayBuffer();
 }
@@ -24,10 +20,6 @@ async function load(described) {
   Object.assign(ort.env.wasm, { numThreads: 1, wasmBinary: wasm });
   session = await ort.InferenceSession.create(model, { executionProviders: ["wasm"] });
   return { ready: true };
-}
-
-function restart({ run, position, velocity }) {
-  state = { run, position: fromBase64(position), velocity: fromBase64(velocity), budget: NaN };
 }
 
 /** Points of a thrown block for which there is room. */
@@ -73,7 +65,10 @@ self.onmessage = ({ data }) => {
   queue = queue.then(async () => {
     try {
       if (data.load) self.postMessage(await load(data.load));
-      if (data.start) restart(data.start);
+      if (data.start) {
+        const { run, position, velocity } = data.start;
+        state = { run, position: fromBase64(position), velocity: fromBase64(velocity), budget: NaN };
+      }
       if (data.throws) self.postMessage(await bundle(data.throws));
     } catch (error) {
       self.postMessage({ error: error.message, run: state?.run });

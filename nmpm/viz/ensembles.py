@@ -1,4 +1,4 @@
-"""Numbers derived from the positions of all particles, frame by frame, and the bands that an ensemble's members fill.
+"""Ensembles in pictures: the share of members at each place, and quantities of all particles along the frames.
 
 Front, mean height and kinetic energy are as in `nmpm.metrics.quantities`, without torch and for all frames at once; the
 particles have one volume.
@@ -6,19 +6,76 @@ particles have one volume.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nmpm.colours import INTERIOR, Rgb, material_colours
 from nmpm.viz.camera import box_corners
 from nmpm.viz.trajectories import Floats, LabelledTrajectories
 
+LEVELS = (0.1, 0.5, 0.9)
+"""Shares of members at which the bands of a picture begin."""
+TINTS = (0.18, 0.35, 0.55)
+"""Share of the ensemble's colour in these bands, light to dark."""
+SEVERAL: Rgb = (84, 98, 122)
+"""The colour of bands where there are several materials."""
+CELL = 1.0
+"""Side of a cell in particle spacings; with smaller ones, chance gaps in a liquid would count as empty."""
 FRONT = 0.95
 """Share of the particles that is behind the front."""
 BANDS = (0.5, 0.9)
 """Shares of the members that the bands of a chart contain."""
 Curve = NDArray[np.float64]
+
+
+def occupied_share(
+    members: Iterable[NDArray[np.floating]], low: NDArray[np.float64], cell: float, shape: tuple[int, int]
+) -> NDArray[np.float64]:
+    """The share of members that occupy each cell of a plane grid.
+
+    A particle occupies its cell, half of each cell beside it, and a quarter of those at its corners; several add up to
+    at most a whole cell.
+
+    Args:
+        members: Positions (N, 2) of each member; those outside of the grid, or NaN, do not count.
+        low: (2,) lower corner of the grid.
+        cell: Side of its square cells.
+        shape: Cells along (x, y).
+
+    Returns:
+        `shape`, in [0, 1].
+    """
+    shares, count = np.zeros(shape), 0
+    for position in members:
+        place = np.floor((position[~np.isnan(position[:, 0])] - low) / cell).astype(np.int64)
+        place = place[((place >= 0) & (place < shape)).all(axis=1)]
+        flat = np.bincount(place[:, 0] * shape[1] + place[:, 1], minlength=shape[0] * shape[1])
+        shares += np.minimum(1.0, _spread(_spread(flat.reshape(shape).astype(np.float64)).T).T)
+        count += 1
+    return shares / max(count, 1)
+
+
+def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Adds half of each row to the rows beside it."""
+    spread = values.copy()
+    spread[1:] += values[:-1] / 2
+    spread[:-1] += values[1:] / 2
+    return spread
+
+
+def ensemble_colour(materials: tuple[str, ...]) -> Rgb:
+    """The colour of an ensemble's bands: that of its material where it has one alone."""
+    return material_colours(materials)[materials[0]] if len(materials) == 1 else SEVERAL
+
+
+def band_colours(materials: tuple[str, ...]) -> list[Rgb]:
+    """The colours of the bands that begin at `LEVELS`, on a picture's background."""
+    colour, background = np.array(ensemble_colour(materials)), np.array(INTERIOR)
+    mixed = (np.round(background + tint * (colour - background)).astype(int).tolist() for tint in TINTS)
+    return [(red, green, blue) for red, green, blue in mixed]
 
 
 @dataclass(frozen=True, eq=False)
