@@ -20,7 +20,7 @@ async function take(data) {
 }
 
 socket.binaryType = "arraybuffer";
-socket.onmessage = ({ data }) => (taken = taken.then(() => take(data)));
+socket.onmessage = ({ data }) => (taken = taken.then(() => take(data)).catch((error) => (element("message").textContent = error.message)));
 socket.onclose = ({ reason }) => {
   element("message").textContent = `${reason || "nmpm play has ended"}. Reload the page to play on.`;
   element("message").hidden = false;
