@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nmpm.data.datamodule import TrajectoryDataModule
-from nmpm.emulator import Emulator, unroll
+from nmpm.emulator import Emulator, Rollout, unroll
 from nmpm.emulator.constraints import Constraints
 from nmpm.emulator.rollouts import recomputed, unroll_with_gradients
 from nmpm.errors import ConfigError
@@ -68,7 +68,7 @@ def test_without_a_discount_gradients_are_those_of_plain_backpropagation_to_the_
     module, batch = step(gradient_discount=1.0)
     bundles = list(unroll(module.emulator, batch.initial, BUNDLES))
     predicted = torch.cat([bundle.position for bundle in bundles], dim=1)
-    error = module.error(predicted, batch, module.emulator.scene, module.emulator.grid, module.emulator.frames)
+    error = module.loss(Rollout(predicted, {}), batch, module.emulator)
     plain = torch.autograd.grad(error, list(module.parameters()))
     assert torch.equal(gradient(module, batch), torch.cat([slope.reshape(-1) for slope in plain]).double())
 
