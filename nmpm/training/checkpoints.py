@@ -114,11 +114,8 @@ def check_same_recipe(hyper_parameters: Mapping[str, Any], recipe: EmulatorRecip
 def adopt_arguments(checkpoint: Mapping[str, Any], current: Mapping[str, Any], optimizer: Optimizer) -> list[str]:
     """Change a checkpoint, in place, to go on with the current hyperparameters and the optimizer's arguments.
 
-    Returns:
-        What has changed, such as "model.optimizer.lr = 0.001 (was 0.003)".
-
-    Raises:
-        ConfigError: if the checkpoint has the state of another kind of optimizer.
+    Returns what has changed, such as "model.optimizer.lr = 0.001 (was 0.003)"; ConfigError for another kind of
+    optimizer.
     """
     kind, stored = class_path(type(optimizer)), with_loss(checkpoint["hyper_parameters"])
     stored_kind = checkpoint.get("nmpm_optimizer", kind)

@@ -12,7 +12,7 @@ from nmpm.training.losses import PositionLoss, density_error, position_error, po
 from tests.scenes import box, cloud, emulator_of, padded, window_of
 
 
-@pytest.mark.parametrize("loss", [PositionLoss(), PositionLoss(1.0, 0.0), PositionLoss(0.3, 0.0, 0.0)], ids=str)
+@pytest.mark.parametrize("loss", [PositionLoss(), PositionLoss(1.0, 0.0), PositionLoss(0.1, 1.0, 0.0)], ids=str)
 class TestPositionLoss(LossContract):
     @pytest.fixture(autouse=True)
     def choose(self, loss):
@@ -102,13 +102,6 @@ def test_the_density_error_is_added_as_it_is():
     density = density_error(predicted[:, last], window.target[:, last], window, scene, grid)
     alone, both = (loss_of(predicted, window, 2, 0.5, weight) for weight in (0.0, 3.0))
     torch.testing.assert_close(both, alone + 3 * density)
-
-
-def test_perfect_predictions_have_finite_gradients_at_any_power():
-    window = calm_and_violent()[2]
-    moved = window.target.clone().requires_grad_()
-    loss_of(moved, window, 4, 0.1, 1.0).backward()
-    assert moved.grad.isfinite().all()
 
 
 def test_padding_changes_no_error_of_positions_and_densities():

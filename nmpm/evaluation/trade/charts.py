@@ -149,7 +149,8 @@ def _write_names(axes: Any, marked: Sequence[Point], lines: Sequence[Point], ran
     axes.figure.draw_without_rendering()
     left, inside = axes.get_xlim()[0], axes.get_window_extent()
     taken = [_text_box(text) for text in axes.texts]
-    taken += [Bbox.from_extents(*at, *at).padded(5) for at in map(axes.transData.transform, _places(marked, ranks))]
+    places = axes.transData.transform([(p.milliseconds, ranks[p.name].mean) for p in marked]) if marked else ()
+    taken += [Bbox.from_extents(*at, *at).padded(5) for at in places]
     best = sorted(marked, key=lambda p: (-ranks[p.name].probability, ranks[p.name].mean))
     members = [p for p in best if ranks[p.name].member]
     others = {kind: [p for p in best if p.kind is kind and p not in members] for kind in Kind}
@@ -174,10 +175,6 @@ def _text_box(text: Any) -> Any:
     """The box of an annotation's letters in pixels, without its arrow."""
     text.update_positions(text.figure.canvas.get_renderer())
     return Text.get_window_extent(text)
-
-
-def _places(points: Sequence[Point], ranks: Mapping[str, Rank]) -> list[tuple[float, float]]:
-    return [(p.milliseconds, ranks[p.name].mean) for p in points]
 
 
 def _short_name(point: Point) -> str:

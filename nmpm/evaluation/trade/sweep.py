@@ -249,16 +249,16 @@ def make_choices(
     nudges: Mapping[str, float] | None = None,
     **match: Any,
 ) -> list[Choice]:
-    """All choices of a sweep.
+    """All choices of a sweep; of scenes without simulator there are no choices of it, and no floors.
 
     Args:
         sweep: Settings.
-        scenes: What is predicted; without simulator there are no choices of it, and no floors.
+        scenes: What is predicted.
         models: Trained emulators on the CPU, by name; those of other scenes are rebuilt for these.
         device: Where they compute.
         predictors: Make those of other packages.
         nudges: Cells by which the starts of a model's members are displaced, by name; the usual ones for others.
-        match: How models take scenes of another kind: `materials`, `stride` and `strict` of `fit_to_scenes`.
+        match: `materials`, `stride` and `strict` of `fit_to_scenes`.
 
     Raises:
         ConfigError: if a model cannot take the scenes, there is no such setting, or two choices have one name.
@@ -331,13 +331,10 @@ def _simulator_choice(preset: Preset, factor: int, name: str = "", nudge: float 
 
 
 def _model_choices(settings: ModelSettings, model: FittedModel, scenes: Scenes, device: torch.device) -> list[Choice]:
-    """All forms of a model.
+    """All forms of a model; ConfigError if there is no such runtime.
 
     Forms that predict the same in the same way, such as those of a model without constraints, are listed once. The
     first of each setting is not part of a form's name.
-
-    Raises:
-        ConfigError: if there is no such runtime.
     """
     facts = _facts(model)
     forms: dict[str, Choice] = {}
