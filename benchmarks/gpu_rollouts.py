@@ -4,65 +4,52 @@ python benchmarks/gpu_rollouts.py --device cuda
 python benchmarks/gpu_rollouts.py --device cuda --zoo goop wbcsph --batches 1 64 --json gpu_rollouts.json
 
 A thrown block of as many particles as the model's test scenes have, so many times per batch. Milliseconds per frame of
-one scene, median and range: operation by operation, by CUDA graphs of torch's operations, and by default, which are
-graphs of kernels in Triton where they take the model; "tiles" are those in many programs for each scene, of which small
-scenes take one by default. Before that one bundle without TensorFloat-32 is compared with
-the CPU's: the largest gap in cells, which may be twice the one operation by operation and 0.001. Exits with 1 if one is
-larger.
+one scene, median and range: operation by operation, by CUDA graphs of torch's operations (the default), and by each
+engine of another package that takes the model, such as plugins/nmpm-triton. Before that one bundle without
+TensorFloat-32 is compared with the CPU's: the largest gap in cells, which may be twice the one operation by operation
+and 0.001. Exits with 1 if one is larger.
 """
 
 from __future__ import annotations
 
-import copy
 import sys
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from functools import partial
-from types import MappingProxyType
-from unittest import mock
 
 import torch
 from timing import Spread, describe_machine, make_timing_parser, time_alternating, write_json
 from torch import Tensor
 
+from nmpm.backends import ENGINES
 from nmpm.emulator import Emulator, rollout
+from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.transfer import without_kernels
 from nmpm.zoo import Pretrained, Zoo
 from nmpm.zoo.measures.speed import repeat_scene, thrown_scene
 
-ONE_BY_ONE, TILES = "operations", "tiles"
+ONE_BY_ONE = "operations"
 BUNDLES = 4
 """Calls of the network in each timed rollout."""
 
 
 def make_forms(model: Pretrained, device: torch.device) -> dict[str, Emulator]:
     """The emulator as it is computed on the device, by name."""
-    if device.type != "cuda":
-        return {ONE_BY_ONE: model.emulator}
-    by_torch = copy.copy(model.emulator)
-    by_torch.engines = ()
-    forms = {ONE_BY_ONE: model.emulator, "graphs": by_torch, "default": model.emulator}
-    return forms | ({TILES: copy.copy(model.emulator)} if "triton" in model.emulator.engines else {})
+    forms = {ONE_BY_ONE: model.emulator}
+    if device.type == "cuda":
+        forms["graphs"] = model.emulator
+        for name in ENGINES.plugins:
+            try:
+                forms[name] = model.emulator.with_engine(name)
+            except ConfigError as error:  # it does not take the model
+                sys.stdout.write(f"{error}\n")
+    return forms
 
 
 def roll_out(form: str, emulator: Emulator, state: Particles, frames: int) -> Tensor:
-    """A rollout by a form of `make_forms`."""
-    with _FORMS.get(form, nullcontext)():
+    """A rollout by a form of `make_forms`; the first one computes without recordings."""
+    with without_kernels() if form == ONE_BY_ONE else nullcontext():
         return rollout(emulator, state, frames)
-
-
-def in_tiles() -> AbstractContextManager[object]:
-    """A context in which kernels in Triton take no scene in one program."""
-    from nmpm.emulator.engines.triton import launch  # Triton comes with torch's builds for CUDA
-
-    return mock.patch.object(launch, "ONE_PROGRAM", 0)
-
-
-_FORMS: Mapping[str, Callable[[], AbstractContextManager[object]]] = MappingProxyType(
-    {ONE_BY_ONE: without_kernels, TILES: in_tiles}
-)
-"""Contexts of forms; the first one also computes without recordings."""
 
 
 def compare_with_cpu(name: str, forms: dict[str, Emulator]) -> bool:

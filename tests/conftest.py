@@ -39,8 +39,6 @@ def pytest_configure(config: pytest.Config) -> None:
         chosen = find_device(config.getoption("--device"))
     except ConfigError as error:
         raise pytest.UsageError(f"--device: {error}") from error
-    if not torch.cuda.is_available():
-        os.environ.setdefault("TRITON_INTERPRET", "1")  # read where Triton is imported
     ProcessorContract.device = TransferContract.device = str(chosen)
     if chosen.type == "cuda":
         torch.backends.cudnn.allow_tf32 = False  # tolerances are those of float32

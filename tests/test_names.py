@@ -54,7 +54,8 @@ OPTIONS = {f"--{name}" for name in (*LIGHTNING, *SECTIONS)} | {
     if isinstance(word, ast.Constant)
 } | {label(field) for kind in commands(COMMANDS.values()) for field in fields(kind)}  # fmt: skip
 OTHER_PROGRAMS = re.compile(
-    r"pip install[^:;({]*|`hf [^`]*`|--include \{}|nmpm\.(?:plugins|readers|writers|scenes|commands|stress)\b"
+    r"pip install[^:;({]*|`hf [^`]*`|--include \{}"
+    r"|nmpm\.(?:plugins|readers|writers|scenes|commands|stress|engines|runtimes)\b"
 )
 
 EXTRAS = {"install": 0, "require": 1}

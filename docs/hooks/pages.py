@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -19,9 +19,12 @@ from unittest import mock
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
+from nmpm.backends import ENGINES
 from nmpm.cli import COMMANDS, main
 from nmpm.cli.command import summary
 from nmpm.emulator.engines import rules
+from nmpm.emulator.runtimes import OpenVINO, Windows
+from nmpm.zoo.export.parts import Network, Solid, Step
 
 ROOT = Path(__file__).parents[2]
 INCLUDED = ("[A-Z]*.md", "benchmarks/**/*.md", "zoo/**/*.md", "notebooks/*.ipynb")
@@ -119,7 +122,10 @@ def configuration_page() -> str:
 
 def engines_page() -> str:
     """What runs where, by the tables of `nmpm.emulator.engines.rules`."""
-    engines = ("torch", *rules.FASTER)
+    everything = [rule.feature for rule in (*rules.MODELS, *rules.CALLS)]
+    engines = {"torch": everything} | {f.name: f.features for name in ENGINES.built_in for f in ENGINES[name]}
+    runtimes = {kind.name: kind.features for kind in (OpenVINO, Windows)}
+    parts = {part.__name__.lower(): part.features for part in (Step, Network, Solid)}
     tried = "\n".join(f"| {name} | {where} |" for name, where in rules.TRIED.items())
     refusals = "\n".join(f"- {rule.feature}" for rule in rules.RECORDINGS)
     errors = "\n".join(f"- {rule.feature}" for rule in rules.TRAINING_ERRORS)
@@ -137,20 +143,20 @@ def engines_page() -> str:
         f" Not recorded are shapes that change with each call, and:\n\n{refusals}\n\n"
         "## Runtimes\n\nThey compute the network of rollouts, without gradients. What is not marked is refused in one"
         " line.\n\n"
-        f"{_table(rules.RUNTIMES, ('openvino', 'windows'))}\n\n"
+        f"{_table(rules.NETWORKS, runtimes)}\n\n"
         "## Exported files\n\n`nmpm export` writes the *step* (a whole call), with `--processor` the *network* alone,"
         " with `--solid` the cells of obstacles. What is not marked is refused in one line; all else is exported.\n\n"
-        f"{_table(rules.EXPORTS, ('step', 'network', 'solid'))}\n\n"
+        f"{_table(rules.EXPORTS, parts)}\n\n"
         "## Errors of trainings\n\n"
         f"Numba's kernels compute the losses of positions and densities too, but for:\n\n{errors}\n\n"
         f"## Where this has run\n\n| | on |\n|---|---|\n{tried}\n"
     )
 
 
-def _table(rows: Sequence[rules.Rule[Any]], columns: Sequence[str]) -> str:
-    """Features, and a mark for each column that takes them, as torch does."""
+def _table(rows: Sequence[rules.Rule[Any]], columns: Mapping[str, Collection[str]]) -> str:
+    """Features, and a mark in each column for those that it takes."""
     lines = [["feature", *columns], ["---", *([":-:"] * len(columns))]]
-    lines += [[rule.feature, *("✓" if name in ("torch", *rule.engines) else "" for name in columns)] for rule in rows]
+    lines += [[rule.feature, *("✓" if rule.feature in taken else "" for taken in columns.values())] for rule in rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 

@@ -84,7 +84,7 @@ class Stress(ModelOptions, DeviceOptions, ThreadsOptions, RuntimeOptions, Strict
 
     @classmethod
     def help_values(cls) -> Mapping[str, str]:
-        return {"groups": ", ".join(GROUPS)}
+        return {**super().help_values(), "groups": ", ".join(GROUPS)}
 
     def __post_init__(self) -> None:
         super().__post_init__()

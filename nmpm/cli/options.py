@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 from nmpm._support.atomic import file_obstacle, folder_obstacle, name_obstacle
 from nmpm._support.machine import check_device_name, find_device
-from nmpm._support.messages import one_line, suggestion
+from nmpm._support.messages import suggestion
 from nmpm._support.shipped import find_preset, preset_names
+from nmpm.backends import ENGINES, RUNTIMES, check_runtime
 from nmpm.cli.command import Command, option
 from nmpm.data.stated import Options, Text
 from nmpm.errors import ConfigError
@@ -34,19 +35,6 @@ def choose_threads(model: Pretrained, stated: int | None) -> None:
         torch.set_num_threads(choice.most)
         # Programs compiled for a number of threads would be compiled anew for another.
         model.emulator.thread_choice = None if model.emulator.runtime.fixed_shapes else choice
-
-
-RUNTIMES = ("auto", "openvino", "windows", "eager")
-"""Values of `--runtime`; `nmpm.emulator.runtimes`, which imports torch, has them."""
-
-
-def check_runtime(name: str) -> None:
-    """Raise ConfigError if a `--runtime` does not exist; former names are accepted."""
-    if name not in (*RUNTIMES, "cuda-graph", "triton"):
-        raise ConfigError(
-            f"No runtime is called {one_line(repr(name), 60)}; there are {', '.join(RUNTIMES)}."
-            f"{suggestion(name[:60], RUNTIMES)}"
-        )
 
 
 def check_model(model: str, root: Path | None = None) -> None:
@@ -199,10 +187,15 @@ class RuntimeOptions(Command):
 
     Args:
         runtime: What computes the network: eager (torch, default), openvino (CPU, the extra of that name), windows
-            (for large scenes that are mostly empty), or auto for the faster of eager and openvino here.
+            (for large scenes that are mostly empty){further}, or auto for the faster of eager and openvino here; or the
+            engine that computes all else: {engines}.
     """
 
     runtime: Runtime = "eager"
+
+    @classmethod
+    def help_values(cls) -> Mapping[str, str]:
+        return {"further": "".join(f", {name}" for name in RUNTIMES.plugins), "engines": ", ".join(ENGINES)}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -94,7 +94,7 @@ class RollOut(ModelOptions, DeviceOptions, ThreadsOptions, RuntimeOptions, Stric
     def help_values(cls) -> Mapping[str, str]:
         from nmpm.data.write import suffixes
 
-        return {"suffixes": suffixes()}
+        return {**super().help_values(), "suffixes": suffixes()}
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from nmpm._support.machine import copy_to
 from nmpm._support.threads import ThreadChoice
+from nmpm.backends import ENGINES
 from nmpm.decoders import Decoder
 from nmpm.emulator.bundle import Bundle as Bundle
 from nmpm.emulator.bundle import RolloutContext as RolloutContext
@@ -24,8 +25,7 @@ from nmpm.emulator.constraints import Constraints, energy, mass_shares
 from nmpm.emulator.engines import find_engine
 from nmpm.emulator.engines.graphs import RecordedCalls
 from nmpm.emulator.engines.numba.parameters import KernelParameters, kernel_parameters
-from nmpm.emulator.engines.rules import MODELS, lacks, model_engines
-from nmpm.emulator.engines.trial import KernelTrial
+from nmpm.emulator.engines.rules import MODELS, lacks, takes
 from nmpm.emulator.fields import FieldScales
 from nmpm.emulator.rasterise import solid_fraction, wall_fraction
 from nmpm.emulator.runtimes import Eager, Runtime, find_runtime
@@ -53,9 +53,9 @@ class Emulator(nn.Module):
 
     Attributes:
         runtime: Computes the network.
-        engines: Names of the engines beside torch's that compute all that the recipe has, the fastest first.
+        engine: Name of the engine; torch's operations compute what it does not take.
+        engine_forms: Those of its forms that compute all that the recipe has.
         recorded_calls: Records and replays calls on a CUDA GPU.
-        kernel_trial: Compares Triton's kernels with torch before they are used.
         thread_choice: Sets torch's number of threads for each call; None to leave it alone.
     """
 
@@ -73,9 +73,9 @@ class Emulator(nn.Module):
     def __init__(self, recipe: EmulatorRecipe) -> None:
         super().__init__()
         self.recipe = recipe
-        self._set_engines(recipe)
+        self._set_engine("numba", recipe)
         self.runtime: Runtime = Eager()
-        self.recorded_calls, self.kernel_trial = RecordedCalls(), KernelTrial()
+        self.recorded_calls = RecordedCalls()
         self.thread_choice: ThreadChoice | None = None
         self.grid = recipe.grid
         scene, frames = recipe.scene, recipe.frames
@@ -153,7 +153,7 @@ class Emulator(nn.Module):
         return other
 
     def with_runtime(self, runtime: str | Runtime) -> Emulator:
-        """This emulator with its network computed by a runtime, or one of `RUNTIMES` by name; weights are shared.
+        """This emulator with its network computed by a runtime, one of `nmpm.backends.RUNTIMES`; weights are shared.
 
         Raises:
             ConfigError: if there is no such runtime, or it cannot run here; one that lacks an operation of the network
@@ -165,6 +165,21 @@ class Emulator(nn.Module):
             raise ConfigError(f"The runtime {other.runtime.name} does not run {reason}.")
         return other
 
+    def with_engine(self, name: str) -> Emulator:
+        """This emulator with its calls computed by an engine of `nmpm.backends.ENGINES`; weights are shared.
+
+        Calls that it does not take are computed by torch's operations, as are all on a GPU by default.
+
+        Raises:
+            ConfigError: if there is no such engine, or it computes no call of this model.
+        """
+        other = copy.copy(self)
+        other._set_engine(name, self.recipe)
+        if ENGINES[name] and not other.engine_forms:
+            missing = lacks(MODELS, self.recipe, ENGINES[name][0].features)
+            raise ConfigError(f"The engine {name} does not compute {', '.join(missing)}.")
+        return other
+
     def with_constraints(self, constraints: Constraints) -> Emulator:
         """This emulator with other constraints; weights and statistics are shared, not copied."""
         return self._with_recipe(dataclasses.replace(self.recipe, constraints=constraints))
@@ -172,19 +187,20 @@ class Emulator(nn.Module):
     def _with_recipe(self, recipe: EmulatorRecipe) -> Emulator:
         other = copy.copy(self)
         other.recipe, other.grid = recipe, recipe.grid
-        other._set_engines(recipe)
+        other._set_engine(self.engine, recipe)
         return other
 
-    def _set_engines(self, recipe: EmulatorRecipe) -> None:
-        """Find out which engines compute all of a recipe, and what those with kernels need of it."""
-        self.engines = model_engines(recipe)
-        self._kernel_parameters = kernel_parameters(recipe) if self.engines else None
+    def _set_engine(self, name: str, recipe: EmulatorRecipe) -> None:
+        """Find out which forms of an engine compute all of a recipe, and what those with kernels need of it."""
+        self.engine = name
+        self.engine_forms = tuple(form for form in ENGINES[name] if takes(MODELS, recipe, form.features))
+        self._kernel_parameters = kernel_parameters(recipe) if self.engine_forms else None
 
     @property
     def kernel_parameters(self) -> KernelParameters:
-        """What engines with kernels need; raises ConfigError if none of them computes all that the recipe has."""
+        """What engines with kernels need; raises ConfigError if this one does not compute all that the recipe has."""
         if self._kernel_parameters is None:
-            raise ConfigError(f"No engine with kernels takes {', '.join(lacks('numba', MODELS, self.recipe))}.")
+            raise ConfigError(f"No kernels of the engine {self.engine} compute all of this model.")
         return self._kernel_parameters
 
     def with_grid_moved(self, shift: Sequence[float]) -> Emulator:

@@ -222,7 +222,7 @@ def position_error(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid) 
 def position_errors(predicted: Tensor, target: Tensor, mask: Tensor, grid: Grid, frames: int) -> Tensor:
     """`position_error` of each of B windows and of each bundle of `frames` frames, (B, T / frames)."""
     check_comparable(predicted, target, frames)  # (kernels check no bounds)
-    if takes("numba", TRAINING_ERRORS, PositionPair(predicted, target, grid)):
+    if takes(TRAINING_ERRORS, PositionPair(predicted, target, grid)):
         from nmpm.training.kernels import PositionErrors
 
         errors: Tensor = PositionErrors.apply(predicted, target, mask, grid, frames)  # type: ignore[no-untyped-call]
@@ -290,7 +290,7 @@ def density_score(
 def volume_fractions(position: Tensor, window: Window, scene: Scene, grid: Grid, there: Tensor | None = None) -> Tensor:
     """(B, F, nodes and materials) volume fractions by linear weights; arguments and gradients as of `density_error`."""
     cells, fraction = grid.to_cells(position, position.dtype), scene.particle_volume / grid.cell_volume
-    kernels = there is None and takes("numba", TRAINING_ERRORS, PositionPair(position, position.detach(), grid))
+    kernels = there is None and takes(TRAINING_ERRORS, PositionPair(position, position.detach(), grid))
     if kernels and (sizes := scene_volumes(window.volume, window.mask)) is not None:
         from nmpm.training.kernels import Counts
 

@@ -19,7 +19,7 @@ from nmpm._support.threads import usable_cores
 Fact = tuple[str, str]
 """A name and what is so."""
 NEEDED = ("torch", "lightning", "torchmetrics", "neuraloperator", "jsonargparse", "numpy", "scipy", "numba", "h5py")
-OPTIONAL = ("openvino", "onnxruntime", "triton", "pyvista", "pyarrow", "imageio-ffmpeg")
+OPTIONAL = ("openvino", "onnxruntime", "nmpm-triton", "pyvista", "pyarrow", "imageio-ffmpeg")
 INSTRUCTIONS = {
     "AVX2": ("avx2",),
     "AVX-512": ("avx512f",),

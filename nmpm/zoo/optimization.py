@@ -1,4 +1,4 @@
-"""Faster runtimes for trained models, compared with torch's own results before they are used."""
+"""Faster runtimes and engines for trained models, compared with torch's own results before they are used."""
 
 from __future__ import annotations
 
@@ -9,19 +9,21 @@ import time
 import torch
 from torch import Tensor
 
+from nmpm._support.messages import one_line
+from nmpm.backends import AUTO, ENGINES, RUNTIMES, check_runtime
 from nmpm.emulator import Emulator
+from nmpm.emulator.engines.explanation import missing_features
 from nmpm.emulator.rollouts import rollout
-from nmpm.emulator.runtimes import RUNTIMES, Eager, Runtime, check_runtime
+from nmpm.emulator.runtimes import Eager, Runtime
 from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.zoo.states import thrown_state
 
-AUTO = "auto"
-"""Stands for the fastest of `RUNTIMES` that can run the model here, as measured."""
 TOLERANCE = 1e-3
 """Cells by which positions after one bundle may differ from torch's in float32."""
 _EXAMPLE = 300  # particles of the example by which runtimes are compared
 _SPEED = 0.2  # cells per frame, of the particles of the example: at rest, the network would have little to say
+_SHARE = 0.1  # of particles that may differ by more with constraints, whose thresholds amplify rounding
 _BUNDLES, _ROUNDS = 4, 3  # of the rollouts that are timed
 _LOG = logging.getLogger(__name__)
 
@@ -45,20 +47,23 @@ def optimize(emulator: Emulator, runtime: str | Runtime) -> Emulator:
 
     Args:
         emulator: In evaluation mode.
-        runtime: One of `RUNTIMES`, or its name, or "auto".
+        runtime: One of `RUNTIMES`, or its name, or that of one of `ENGINES`, or "auto".
 
     Raises:
         ConfigError: if there is no such runtime, it cannot run the model here, or its results differ from torch's;
             "auto" leaves such a runtime out.
     """
     if isinstance(runtime, str):
-        check_runtime(runtime, (AUTO, *RUNTIMES))
+        check_runtime(runtime)
+        if runtime in ENGINES:
+            return _with_engine(emulator, runtime)
     if runtime != AUTO:
         return _checked(emulator, runtime)
     fitting = []
-    for name in (name for name, kind in RUNTIMES.items() if kind.automatic):
+    for name in RUNTIMES:
         try:
-            fitting.append(_checked(emulator, name))
+            if RUNTIMES[name].automatic:
+                fitting.append(_checked(emulator, name))
         except ConfigError as error:
             _LOG.info("%s", error)
     if len(fitting) == 1:
@@ -72,8 +77,32 @@ def _checked(emulator: Emulator, runtime: str | Runtime) -> Emulator:
     """The emulator with a runtime whose results are torch's."""
     faster = emulator.with_runtime(runtime)
     if not isinstance(faster.runtime, Eager):
-        _check_deviation(emulator.with_runtime("eager"), faster, small_example(emulator))
+        _check_deviation(
+            f"runtime {faster.runtime.name}", emulator.with_runtime("eager"), faster, small_example(emulator)
+        )
     return faster
+
+
+def _with_engine(emulator: Emulator, name: str) -> Emulator:
+    """The emulator with an engine that takes its rollouts here, and whose results are torch's."""
+    other, reference = emulator.with_engine(name), emulator.with_engine("torch")
+    if missing := min((missing_features(emulator, form, False) for form in ENGINES[name]), key=len, default=[]):
+        raise ConfigError(f"The engine {name} does not compute {', '.join(missing)}: use the runtime eager.")
+    try:
+        state = _check_deviation(f"engine {name}", reference, other, small_example(emulator))
+        paths = [_positions(form, state) for form in (reference, other)]
+    except ConfigError:
+        raise
+    except Exception as failure:  # (of whatever compilers and drivers raise)
+        reason = f"{type(failure).__name__}: {one_line(failure, 200)}"
+        raise ConfigError(f"The engine {name} fails here ({reason}): use the runtime eager.") from failure
+    apart = ~((paths[0] - paths[1]).norm(dim=-1).amax(1) <= TOLERANCE)
+    if (share := float(apart[state.mask].float().mean())) > _SHARE:
+        raise ConfigError(
+            f"The engine {name} computes something else than torch: with constraints {share:.0%} of the particles"
+            f" differ by more than {TOLERANCE} cells after one bundle. Use the runtime eager."
+        )
+    return other
 
 
 def _seconds(emulator: Emulator, state: Particles) -> float:
@@ -86,8 +115,8 @@ def _seconds(emulator: Emulator, state: Particles) -> float:
     return min(times[1:])
 
 
-def _check_deviation(emulator: Emulator, faster: Emulator, state: Particles) -> None:
-    """Compare one bundle without constraints, whose thresholds would amplify rounding.
+def _check_deviation(name: str, emulator: Emulator, faster: Emulator, state: Particles) -> Particles:
+    """Compare one bundle of a state, moved at random, without constraints, whose thresholds would amplify rounding.
 
     In bfloat16 a runtime may be twice as far from float32 as torch's bfloat16 is: each rounds in places of its own.
     """
@@ -95,20 +124,21 @@ def _check_deviation(emulator: Emulator, faster: Emulator, state: Particles) -> 
     cell = state.velocity.new_tensor(emulator.grid.spacing)
     moving = dataclasses.replace(state, velocity=state.velocity + _SPEED * cell * noise)
     forms = (emulator.with_network(torch.float32), emulator, faster)
-    exact, *paths = (_positions(form, moving) for form in forms)
+    exact, *paths = (_positions(form.unconstrained(), moving) for form in forms)
     reference, other = (float((path - exact).norm(dim=-1).max()) for path in paths)
     limit = TOLERANCE + 2 * reference
-    name, precision = faster.runtime.name, str(emulator.network_precision).removeprefix("torch.")
-    _LOG.info("The runtime %s, %s: within %.1e cells of torch in float32 after a bundle.", name, precision, other)
+    precision = str(emulator.network_precision).removeprefix("torch.")
+    _LOG.info("The %s, %s: within %.1e cells of torch in float32 after a bundle.", name, precision, other)
     if not other <= limit:
         raise ConfigError(
-            f"The runtime {name} computes something else than torch: positions after one bundle differ by {other:.2g}"
+            f"The {name} computes something else than torch: positions after one bundle differ by {other:.2g}"
             f" cells, where {limit:.2g} are expected in {precision}. Use the runtime eager."
         )
+    return moving
 
 
 @torch.no_grad()
 def _positions(emulator: Emulator, state: Particles) -> Tensor:
     """(B, m, N, D) after one bundle, in cells."""
-    position: Tensor = emulator.unconstrained()(state).position
+    position: Tensor = emulator(state).position
     return position / position.new_tensor(emulator.grid.spacing)

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from nmpm._support.machine import find_device
+from nmpm.backends import AUTO
 from nmpm.data.format import Trajectory
 from nmpm.emulator import (
     NETWORK_PRECISIONS,
@@ -37,7 +38,7 @@ from nmpm.errors import ConfigError
 from nmpm.particles import Particles
 from nmpm.scene import Scene
 from nmpm.zoo.card import preset_of, stated_nudge
-from nmpm.zoo.optimization import AUTO, optimize
+from nmpm.zoo.optimization import optimize
 from nmpm.zoo.states import THROWN, TOO_FAST, Bodies, StateBuilder, state_of, thrown_state
 
 if TYPE_CHECKING:

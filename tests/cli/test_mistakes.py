@@ -16,9 +16,7 @@ import pytest
 from nmpm import EmulatorModule
 from nmpm._support.shipped import user_home
 from nmpm.cli import COMMANDS, expand_home, main
-from nmpm.cli.options import RUNTIMES
 from nmpm.cli.training import OPTIONS_FILE, forget_unused_slurm
-from nmpm.emulator import runtimes
 from nmpm.errors import ConfigError, DataError
 from nmpm.training.checkpoints import AtomicCheckpointIO
 from nmpm.training.preflight import check_disk
@@ -254,10 +252,6 @@ def test_a_command_imports_what_it_needs(words, unwanted):
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-500:]
     assert done.stdout.splitlines()[-1] == "imported []"
-
-
-def test_names_that_commands_have_without_torch_are_those_that_there_are():
-    assert set(RUNTIMES) == {"auto", *runtimes.RUNTIMES}
 
 
 def test_simulators_and_numba_are_imported_for_simulated_data_alone():

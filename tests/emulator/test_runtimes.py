@@ -5,8 +5,9 @@ import warnings
 import pytest
 import torch
 
+from nmpm.backends import FORMER, RUNTIMES
 from nmpm.emulator import Emulator
-from nmpm.emulator.runtimes import FORMER, RUNTIMES, Eager, find_runtime, runtime
+from nmpm.emulator.runtimes import Eager, find_runtime, runtime
 from nmpm.emulator.runtimes.runtime import Programs
 from nmpm.errors import ConfigError
 from tests.scenes import box, cloud, emulator_of
@@ -17,9 +18,8 @@ def small(scene=None, **constraints) -> Emulator:
 
 
 def test_a_runtime_is_found_by_name_and_another_is_refused_with_the_known_ones():
-    assert {name: type(find_runtime(name)) for name in RUNTIMES} == dict(RUNTIMES)
-    assert list(RUNTIMES)[-1] == "eager"
-    with pytest.raises(ConfigError, match=r"No runtime is called 'openvin'.*windows, eager.*Did you mean openvino\?"):
+    assert all(find_runtime(name).name == name for name in RUNTIMES)
+    with pytest.raises(ConfigError, match=r"There is no runtime 'openvin'.*windows, eager.*Did you mean openvino\?"):
         small().with_runtime("openvin")
 
 

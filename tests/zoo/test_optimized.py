@@ -1,18 +1,27 @@
 """Faster runtimes of trained models are compared with torch before they are used."""
 
+import dataclasses
 import logging
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib.util import find_spec
+from typing import ClassVar
 
 import pytest
 import torch
 
+from nmpm.backends import ENGINES
+from nmpm.emulator import Bundle
+from nmpm.emulator.engines import find_engine
+from nmpm.emulator.engines.engine import EngineForm
+from nmpm.emulator.engines.torch.engine import TorchEngine
 from nmpm.emulator.runtimes import Eager, OpenVINO, Runtime
 from nmpm.errors import ConfigError
+from nmpm.registry import Registry
 from nmpm.transfer import without_kernels
 from nmpm.zoo import Pretrained, optimization
+from tests.scenes import box, emulator_of
 
 
 @pytest.fixture
@@ -42,7 +51,7 @@ class Slow(Eager):
 
 def use(monkeypatch, **runtimes) -> None:
     for module in ("nmpm.emulator.runtimes", "nmpm.zoo.optimization"):
-        monkeypatch.setattr(f"{module}.RUNTIMES", runtimes)
+        monkeypatch.setattr(f"{module}.RUNTIMES", Registry("none", "runtime", runtimes))
 
 
 def test_the_fastest_as_measured_is_taken(model, monkeypatch):
@@ -85,3 +94,56 @@ def test_a_runtime_that_computes_something_else_is_refused(model, monkeypatch):
     with pytest.raises(ConfigError, match="openvino computes something else than torch: positions after one bundle"):
         model.optimized("openvino")
     assert isinstance(model.optimized().emulator.runtime, Eager)
+
+
+class Kernels(TorchEngine):
+    """Torch's operations with a change of the bundles, of another package."""
+
+    change: ClassVar[Callable[[Bundle], Bundle]] = staticmethod(lambda bundle: bundle)
+
+    def predict(self, particles, context):
+        return self.change(super().predict(particles, context))
+
+
+@pytest.fixture
+def kernels(monkeypatch) -> type[Kernels]:
+    """The engine "kernels", registered for rollouts on CPUs."""
+    form = EngineForm(
+        "kernels", "Kernels", frozenset({"a CPU", "rollouts", "the transfers Nearest and Quadratic"}), Kernels
+    )
+    monkeypatch.setattr(ENGINES, "plugins", {"kernels": None})
+    monkeypatch.setitem(ENGINES._loaded, "kernels", (form,))
+    return Kernels
+
+
+def test_an_engine_of_another_package_is_used_where_it_is_asked_for(small, kernels):
+    model = Pretrained(small.requires_grad_(False), {"name": "small"})
+    state = model.example(count=50)
+    solid = model.emulator.solid(state)
+    quick = model.optimized("kernels")
+    assert isinstance(find_engine(quick.emulator, state, solid), kernels)
+    assert quick.emulator.explain().splitlines()[1:3] == [
+        "  rollouts   Kernels", "  trainings  torch's operations",
+    ]  # fmt: skip
+    assert find_engine(model.emulator, state, solid).name == "numba"
+    assert 'further    `optimized("kernels")`' in model.emulator.explain()
+    assert model.optimized("torch").emulator.engine == "torch"
+    with pytest.raises(ConfigError, match="The engine kernels does not compute three dimensions"):
+        Pretrained(emulator_of(box(3), 8), {}).optimized("kernels")
+    with pytest.raises(ConfigError, match="The engine kernels does not compute other devices: use the runtime eager"):
+        model.to("meta").optimized("kernels")
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda bundle: 1 / 0, r"The engine kernels fails here \(ZeroDivisionError: division by zero\)"),
+        (lambda b: dataclasses.replace(b, position=b.position + 0.01), r"after one bundle differ by \d.* cells, where"),
+        (lambda b: dataclasses.replace(b, position=b.position * torch.nan), "after one bundle differ by nan cells"),
+    ],
+    ids=["fail", "differ", "are not finite"],
+)
+def test_an_engine_that_fails_or_computes_something_else_is_refused(small, kernels, change, complaint, monkeypatch):
+    monkeypatch.setattr(kernels, "change", staticmethod(change))
+    with pytest.raises(ConfigError, match=complaint):
+        Pretrained(small.requires_grad_(False), {}).optimized("kernels")

@@ -13,10 +13,10 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -51,7 +51,7 @@ class Flight(Generic[Values]):
 
 @dataclass(frozen=True)
 class Engine(ABC, Generic[Start, Values]):
-    """Computes the calls of an emulator that `nmpm.emulator.engines.rules` gives to it."""
+    """Computes those calls of an emulator of which it takes all features, see `EngineForm`."""
 
     emulator: Emulator
 
@@ -120,6 +120,24 @@ class Engine(ABC, Generic[Start, Values]):
     @abstractmethod
     def land(self, start: Start, flight: Flight[Values]) -> Bundle:
         """The bundle in domain length."""
+
+
+@dataclass(frozen=True)
+class EngineForm:
+    """One form of an engine, for rollouts or for trainings.
+
+    Args:
+        name: Column in the documentation's tables of what runs where.
+        title: For `Emulator.explain`, such as "Numba kernels".
+        features: Those of `nmpm.emulator.engines.rules.MODELS` and `CALLS` that it takes. Torch's operations compute
+            calls with any other one.
+        make: Makes the engine of an emulator.
+    """
+
+    name: str
+    title: str
+    features: frozenset[str]
+    make: Callable[[Emulator], Engine[Any, Any]]
 
 
 def _full_precision(device: str) -> AbstractContextManager[object]:

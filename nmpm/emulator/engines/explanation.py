@@ -3,67 +3,55 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import torch
 
-from nmpm.emulator.engines.rules import CALLS, MODELS, RECORDINGS, RUNTIMES, Call, call_engine, lacks
+from nmpm.backends import ENGINES
+from nmpm.emulator.engines.rules import CALLS, MODELS, NETWORKS, RECORDINGS, Call, lacks
+from nmpm.emulator.runtimes.openvino import OpenVINO
 from nmpm.particles import Particles
 
 if TYPE_CHECKING:
+    from nmpm.emulator.engines.engine import EngineForm
     from nmpm.emulator.model import Emulator
-
-_ENGINES: Mapping[str, str] = MappingProxyType(
-    {
-        "torch": "torch's operations",
-        "numba": "Numba kernels",
-        "numba training": "Numba kernels with gradients",
-        "triton": "Triton kernels",
-        "triton training": "Triton kernels with gradients",
-    }
-)
-_FASTEST: Mapping[tuple[str, bool], str] = MappingProxyType(
-    {
-        ("cpu", False): "numba",
-        ("cpu", True): "numba training",
-        ("cuda", False): "triton",
-        ("cuda", True): "triton training",
-    }
-)
-"""The engine made for a kind of device, and for rollouts or trainings."""
 
 
 @torch.no_grad()
 def explain(emulator: Emulator) -> list[str]:
     """Lines on the engines of rollouts and trainings, the network's runtime, and recordings, where the emulator is."""
     state, precision = _state(emulator), str(emulator.network_precision).removeprefix("torch.")
-    openvino = ", ".join(lacks("openvino", RUNTIMES, emulator))
+    openvino = ", ".join(lacks(NETWORKS, emulator, OpenVINO.features))
     other = f"openvino does not take {openvino}" if openvino else "`optimized()` tries openvino, too"
-    unrecorded = ", ".join(lacks("graph", RECORDINGS, Call(_in_mode(emulator, False), state, emulator.solid(state))))
+    unrecorded = ", ".join(lacks(RECORDINGS, Call(_in_mode(emulator, False), state, emulator.solid(state))))
     recorded = f"no CUDA graphs: {unrecorded}" if unrecorded else "as CUDA graphs, from the second call of a shape on"
-    return [
+    lines = [
         f"On {emulator.device}:",
-        f"  rollouts   {_engine(emulator, state, False)}",
-        f"  trainings  {_engine(emulator, state, True)}",
+        f"  rollouts   {_engine(emulator, False)}",
+        f"  trainings  {_engine(emulator, True)}",
         f"  network    runtime {emulator.runtime.name}, {precision}; {other}",
         f"  recorded   {recorded}",
     ]
+    installed = [f'`optimized("{name}")`' for name in ENGINES.plugins if name != emulator.engine]
+    return lines + ([f"  further    {', '.join(installed)}, of other packages"] if installed else [])
 
 
-def _engine(emulator: Emulator, state: Particles, training: bool) -> str:
-    """The engine of rollouts or trainings, and what keeps a faster one from them."""
-    form = _in_mode(emulator, training)
-    solid = form.solid(state)
+def missing_features(emulator: Emulator, form: EngineForm, training: bool) -> list[str]:
+    """What a form of an engine would not take of the rollouts or trainings of an emulator, where that is."""
+    mode, state = _in_mode(emulator, training), _state(emulator)
     with torch.set_grad_enabled(training):
-        name, faster = call_engine(form, state, solid), _FASTEST.get((state.position.device.type, training), "torch")
-        missing = [*lacks(faster, MODELS, form.recipe), *lacks(faster, CALLS, Call(form, state, solid))]
-    if name.startswith("triton") and (difference := emulator.kernel_trial.difference(form)):
-        return f"{_ENGINES['torch']}; Triton kernels are not used: {difference}"
-    if name == faster:
-        return _ENGINES[name]
-    return f"{_ENGINES[name]}; {_ENGINES[faster]} do not take {', '.join(missing)}"
+        call = Call(mode, state, mode.solid(state))
+        return [*lacks(MODELS, emulator.recipe, form.features), *lacks(CALLS, call, form.features)]
+
+
+def _engine(emulator: Emulator, training: bool) -> str:
+    """The engine of rollouts or trainings, and what keeps the emulator's own from them."""
+    kind = "trainings" if training else "rollouts"
+    form = next((form for form in ENGINES[emulator.engine] if kind in form.features), None)
+    if form is None:
+        return "torch's operations"
+    missing = missing_features(emulator, form, training)
+    return f"torch's operations; {form.title} do not take {', '.join(missing)}" if missing else form.title
 
 
 def _in_mode(emulator: Emulator, training: bool) -> Emulator:

@@ -52,7 +52,7 @@ class RecordedCalls:
 
     def predict(self, emulator: Emulator, particles: Particles, context: RolloutContext) -> Bundle:
         """The emulator's bundle, recorded if this call can be."""
-        if self._failed or not takes("graph", RECORDINGS, Call(emulator, particles, context.solid)):
+        if self._failed or not takes(RECORDINGS, Call(emulator, particles, context.solid)):
             return emulator.runtime.bundle(emulator, particles, context)
         inputs = _inputs(particles, context)
         recording = self._find(emulator, particles, context, _key(particles, inputs))

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from nmpm._support.messages import install, one_line
-from nmpm.emulator.engines.rules import RUNTIMES, refusal
+from nmpm.emulator.engines.rules import NETWORKS, refusal
 from nmpm.emulator.runtimes.runtime import Programs, Runtime, refuse_gradients
 from nmpm.errors import ConfigError
 from nmpm.processors import GridProcessor
@@ -36,12 +36,13 @@ class OpenVINO(Runtime):
     """Compiles a network in its first call for each shape, in a second or two, with as many threads as torch has."""
 
     name: ClassVar[str] = "openvino"
+    features: ClassVar[frozenset[str]] = frozenset({"networks that may see the whole grid, of no known radius"})
 
     def __init__(self) -> None:
         self._programs: Programs[_Program] = Programs()
 
     def unsupported_reason(self, emulator: Emulator) -> str:
-        return refusal(self.name, RUNTIMES, emulator)
+        return refusal(NETWORKS, emulator, self.features)
 
     def fields(self, network: GridProcessor, grid: Tensor, precision: torch.dtype) -> Tensor:
         refuse_gradients(self, network, grid)

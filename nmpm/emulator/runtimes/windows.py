@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nmpm.emulator.engines.rules import RUNTIMES, refusal
+from nmpm.emulator.engines.rules import NETWORKS, refusal
 from nmpm.emulator.runtimes.runtime import Eager, Runtime, refuse_gradients
 from nmpm.errors import ConfigError
 from nmpm.processors import GridProcessor
@@ -239,6 +239,13 @@ class Windows(Runtime):
     name: ClassVar[str] = "windows"
     fixed_shapes: ClassVar[bool] = False
     automatic: ClassVar[bool] = False
+    features: ClassVar[frozenset[str]] = frozenset(
+        {
+            "machines without OpenVINO",
+            "models on other devices than a CPU",
+            "networks in other precisions than float32 and bfloat16",
+        }
+    )
 
     def __init__(self, most_cells: int | None = None) -> None:
         if most_cells is not None and most_cells < 1:
@@ -246,7 +253,7 @@ class Windows(Runtime):
         self._most = most_cells or sys.maxsize
 
     def unsupported_reason(self, emulator: Emulator) -> str:
-        return refusal(self.name, RUNTIMES, emulator)
+        return refusal(NETWORKS, emulator, self.features)
 
     def fields(self, network: GridProcessor, grid: Tensor, precision: torch.dtype) -> Tensor:
         return Eager().fields(network, grid, precision)

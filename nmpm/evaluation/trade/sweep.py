@@ -56,7 +56,7 @@ class ModelSettings:
         precision: Precisions of the network; bfloat16 is left out on processors that emulate it, unless it is the only
             one.
         constraints: "held", with the model's constraints, and "free", without them.
-        runtime: What computes the network, see `nmpm.emulator.runtimes.RUNTIMES`; None for torch and, on a CPU,
+        runtime: What computes the network, see `nmpm.backends.RUNTIMES`; None for torch and, on a CPU,
             OpenVINO if it is installed.
         batch: Batch sizes, in scenes.
         members: Rollouts of each scene by a model's first form, which stand beside it as an ensemble; 0 for none.

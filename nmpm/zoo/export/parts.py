@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -51,12 +52,14 @@ class Part(nn.Module, ABC):
         ConfigError: if the emulator has what the part does not carry, see `nmpm.emulator.engines.rules`.
     """
 
+    features: ClassVar[frozenset[str]] = frozenset()
+    """Those of `EXPORTS` that it carries."""
     inputs: tuple[Value, ...]
     outputs: tuple[Value, ...]
 
     def __init__(self, emulator: Emulator) -> None:
         super().__init__()
-        if reason := refusal(type(self).__name__.lower(), EXPORTS, emulator):
+        if reason := refusal(EXPORTS, emulator, self.features):
             raise ConfigError(f"The model has what exported files do not carry: {reason}.")
         self.emulator = copy.deepcopy(emulator.with_runtime("eager")).cpu().float().eval().requires_grad_(False)
 
@@ -156,6 +159,8 @@ class Step(Part):
 class Network(Part):
     """The network between the transfers with its normalisation: from a grid state to m grid velocity fields."""
 
+    features = frozenset({"bounds: error"})
+
     def __init__(self, emulator: Emulator) -> None:
         super().__init__(emulator)
         scene, shape = emulator.scene, emulator.grid.shape
@@ -186,6 +191,8 @@ class Solid(Part):
     Raises:
         ConfigError: if the scene has no obstacles.
     """
+
+    features = frozenset({"bounds: error"})
 
     def __init__(self, emulator: Emulator) -> None:
         super().__init__(emulator)

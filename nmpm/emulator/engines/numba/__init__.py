@@ -22,3 +22,50 @@ Kernels take the arrays of one scene, C-contiguous and of float32 unless said ot
     ratio             (D,) widths of the cells over that of the first axis
     low, high         the range of particles that the call treats, so that threads share a scene
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from nmpm.emulator.engines.engine import Engine, EngineForm
+
+if TYPE_CHECKING:
+    from nmpm.emulator.model import Emulator
+
+
+def _for_rollouts(emulator: Emulator) -> Engine[Any, Any]:
+    from nmpm.emulator.engines.numba.engine import NumbaEngine  # imported late, as Numba is
+
+    return NumbaEngine(emulator)
+
+
+def _for_trainings(emulator: Emulator) -> Engine[Any, Any]:
+    from nmpm.emulator.engines.numba.training import NumbaTraining
+
+    return NumbaTraining(emulator)
+
+
+_BOTH = frozenset(
+    {
+        "fields", "obstacles that move", "a CPU", "moving obstacles in the state", "sizes of particles",
+        "deterministic algorithms",
+    }
+)  # fmt: skip
+FORMS = (
+    EngineForm(
+        "numba",
+        "Numba kernels",
+        _BOTH
+        | {
+            "three dimensions", "the transfers Nearest and Quadratic", "bounds: reflect", "rollouts",
+            "several sizes in a scene",
+        },
+        _for_rollouts,
+    ),
+    EngineForm(
+        "numba training",
+        "Numba kernels with gradients",
+        _BOTH | {"trainings", "gradients of a rollout"},
+        _for_trainings,
+    ),
+)  # fmt: skip

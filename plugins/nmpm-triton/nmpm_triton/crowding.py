@@ -5,8 +5,8 @@ computes. `volume` (B, N) are the particles' as multiples of the scene's, 0 for 
 import triton
 import triton.language as tl
 
-from nmpm.emulator.engines.triton.grid import SIZES, find_nodes, interpolate
-from nmpm.emulator.engines.triton.motion import confine, load, load_masses, store
+from nmpm_triton.grid import SIZES, find_nodes, interpolate
+from nmpm_triton.motion import confine, load, load_masses, store
 
 
 @triton.jit

@@ -10,7 +10,7 @@ fixed order, and without waiting within a launch.
 import triton
 import triton.language as tl
 
-from nmpm.emulator.engines.triton.grid import SIZES, interpolate, load_kind
+from nmpm_triton.grid import SIZES, interpolate, load_kind
 
 SUMS = tl.constexpr(5)
 """Of each block and frame: what gravity's potential would give if nobody moved; kinetic energy of the particles that

@@ -16,9 +16,9 @@ from nmpm.emulator.engines.torch.advection import BundleStart
 from nmpm.emulator.engines.torch.contact import SURFACE
 from nmpm.emulator.engines.torch.crowding import CLOSED, MAX_SHIFT, SWEEPS
 from nmpm.emulator.engines.torch.support import ENOUGH, MAX_DROP, REACH
-from nmpm.emulator.engines.triton import contact, crowding, grid, launch, motion, rest
-from nmpm.emulator.engines.triton.launch import axes, blocks, decoding, power, programs, walls, warps, whole
 from nmpm.particles import Particles
+from nmpm_triton import contact, crowding, grid, launch, motion, rest
+from nmpm_triton.launch import axes, blocks, decoding, power, programs, walls, warps, whole
 
 _COLUMNS = 16
 """Of cells that a program of `rest.support` treats."""

@@ -4,22 +4,31 @@ import dataclasses
 import os
 import subprocess
 import sys
-import warnings
-from types import SimpleNamespace
+from pathlib import Path
 
 import pytest
 import torch
 
+pytest.importorskip("triton", reason="triton is not installed")
+pytest.importorskip("nmpm_triton", reason="nmpm-triton is not installed: pip install -e plugins/nmpm-triton")
+
+from nmpm_triton import launch
+from nmpm_triton.engine import TritonEngine
+from nmpm_triton.training import TritonTraining
+
+from nmpm.backends import ENGINES
 from nmpm.decoders import Absolute, Acceleration, Blend, Flip
-from nmpm.emulator import Emulator, RolloutContext, rollout
-from nmpm.emulator.engines import ENGINES, find_engine, graphs, rules
+from nmpm.emulator import Emulator, rollout
+from nmpm.emulator.engines import find_engine, graphs, rules
 from nmpm.emulator.engines.torch.engine import TorchEngine
 from nmpm.emulator.rollouts import recomputed
 from nmpm.particles import Particles, lattice
 from nmpm.processors import UNet
 from nmpm.training import recorded_steps
-from nmpm.transfer import without_kernels
+from nmpm.zoo.optimization import optimize
 from tests.scenes import CHANNEL, box, cloud, emulator_of, window_of, with_obstacle
+
+pytestmark = pytest.mark.slow
 
 
 def moving(scene, reach: float = 0.3, cells=8, frames: int = 3, **parts) -> Emulator:
@@ -65,35 +74,24 @@ def state_of(scene, **motion) -> Particles:
 @pytest.fixture
 def triton(monkeypatch, device):
     """Lets emulators take the kernels; without a GPU in Triton's interpreter, and without recordings."""
-    pytest.importorskip("triton", reason="triton is not installed")
-    from nmpm.emulator.engines.triton import launch
-
     monkeypatch.setattr(launch, "BLOCK", 32)  # more than one program for each scene
     if device.type != "cuda":
         if torch.cuda.is_available():
             pytest.skip("kernels are compiled for the GPU: --device cuda")
-        on_gpu(monkeypatch)
-
-
-def on_gpu(monkeypatch) -> None:
-    """Let engines be chosen as on a CUDA GPU with Triton."""
-    monkeypatch.setattr(rules.Call, "device", "cuda")
-    monkeypatch.setattr(graphs, "RECORDINGS", (rules.Rule("a stand-in for a GPU", (), lambda _: True),))
-    monkeypatch.setattr(rules, "_has_triton", lambda: True)
+        monkeypatch.setattr(rules.Call, "device", "cuda")
+        monkeypatch.setattr(graphs, "RECORDINGS", (rules.Rule("a stand-in for a GPU", lambda _: True),))
 
 
 @pytest.mark.usefixtures("triton")
 @pytest.mark.parametrize("name", CASES)
 def test_bundles_are_those_of_tensor_operations(name, device, monkeypatch):
-    from nmpm.emulator.engines.triton import launch
-
     scene, form, motion = CASES[name]
     emulator, state = moving(scene, **form).to(device), state_of(scene, **motion).to(device)
     for most in (launch.ONE_PROGRAM, 0):  # a scene in one program, and in several
         monkeypatch.setattr(launch, "ONE_PROGRAM", most)
         with torch.no_grad():
             context = emulator.context(state)
-            there = ENGINES["triton"](emulator).predict(state, context)
+            there = TritonEngine(emulator).predict(state, context)
             here = TorchEngine(emulator).predict(state, context)
         gap = (there.position - here.position).abs().amax((1, 3)) / emulator.grid.spacing[0]
         speed = (there.velocity - here.velocity).abs().amax(2) / emulator.grid.spacing[0]
@@ -125,7 +123,7 @@ def gradients_of(engine, emulator, state):
 
 def check_training(emulator, reference, state):
     """Values and gradients by kernels are those of tensor operations, of an emulator with the same weights."""
-    path, gradients = gradients_of(ENGINES["triton training"](emulator), emulator, state)
+    path, gradients = gradients_of(TritonTraining(emulator), emulator, state)
     expected, others = gradients_of(TorchEngine(reference), reference, state)
     torch.testing.assert_close(path, expected, rtol=0, atol=1e-5)
     for gradient, other in zip(gradients, others, strict=True):
@@ -148,7 +146,7 @@ def test_trainings_have_the_values_and_gradients_of_tensor_operations(name, devi
 def test_gradients_of_outputs_in_bfloat16_have_their_precision(device):
     emulator, state = moving(box()).train().requires_grad_().to(device), state_of(box()).to(device)
     with torch.autocast(device.type, torch.bfloat16):
-        _, gradients = gradients_of(ENGINES["triton training"](emulator), emulator, state)
+        _, gradients = gradients_of(TritonTraining(emulator), emulator, state)
         _, others = gradients_of(TorchEngine(emulator), emulator, state)
     for gradient, other in zip(gradients, others, strict=True):
         assert gradient.dtype == other.dtype
@@ -171,92 +169,30 @@ def test_rollouts_go_on_from_states_of_any_size_and_precision(device):
     for count in (30, 1):
         state = cloud(box(), count, seed=count).to(device)
         for given in (state, state.double()):
-            with without_kernels():
-                expected = rollout(emulator, given, 4)
-            predicted = rollout(emulator, given, 4)
+            expected = rollout(emulator, given, 4)
+            predicted = rollout(emulator.with_engine("triton"), given, 4)
             assert predicted.dtype == expected.dtype
             torch.testing.assert_close(predicted, expected, rtol=0, atol=1e-4 * emulator.grid.spacing[0])
 
 
 @pytest.mark.usefixtures("triton")
-def test_kernels_that_give_what_torch_gives_are_used(device, recwarn):
-    emulator, state = moving(box(), energy=True).to(device), state_of(box())
-    emulator(state.to(device))
-    assert find_engine(emulator, state.to(device), emulator.solid(state.to(device))).name == "triton"
-    trained = moving(box(materials=("water", "sand"))).train().requires_grad_().to(device)
+def test_the_engine_is_registered_compared_and_used_where_it_is_asked_for(device):
+    assert "triton" in ENGINES
+    emulator, state = moving(box(), energy=True).to(device), state_of(box()).to(device)
+    assert find_engine(emulator, state, emulator.solid(state)).name == "torch"
+    chosen = optimize(emulator, "triton")
+    assert find_engine(chosen, state, emulator.solid(state)).name == "triton"
+    assert chosen.explain().splitlines()[1:3] == [
+        "  rollouts   Triton kernels", "  trainings  Triton kernels with gradients",
+    ]  # fmt: skip
+    trained = moving(box(materials=("water", "sand"))).train().requires_grad_().to(device).with_engine("triton")
     state = state_of(trained.scene).to(device)
     recomputed(trained, state, trained.context(state)).position.sum().backward()
     assert find_engine(trained, state, trained.solid(state)).name == "triton training"
-    assert not recwarn.list
 
 
-@pytest.mark.parametrize(
-    ("change", "complaint"),
-    [
-        (lambda bundle: 1 / 0, r"they fail here \(ZeroDivisionError: division by zero\)"),
-        (
-            lambda b: dataclasses.replace(b, position=b.position + 0.01),
-            r"differ by 0.\d+ cells, where 0.001",
-        ),
-        (lambda b: dataclasses.replace(b, position=b.position * torch.nan), "differ by nan cells"),
-        (lambda bundle: bundle, ""),
-    ],
-    ids=["fail", "differ", "are not finite", "agree"],
-)
-def test_kernels_that_fail_or_differ_are_left_to_torch_with_one_warning(change, complaint, monkeypatch):
-    class Kernels(TorchEngine):
-        """Torch's operations with a change."""
-
-        name = "triton"
-
-        def predict(self, particles, context):
-            return change(super().predict(particles, context))
-
-    made = SimpleNamespace(TritonEngine=Kernels)
-    monkeypatch.setitem(sys.modules, "nmpm.emulator.engines.triton.engine", made)
-    on_gpu(monkeypatch)
-    emulator, state = moving(box(), energy=True), state_of(box())
-    context = RolloutContext(emulator.solid(state), emulator.budget(state))
-    expected = TorchEngine(emulator).predict(emulator.with_plain_padding(state), context)
-    if complaint:
-        with pytest.warns(UserWarning, match=f"Kernels in Triton are not used on cpu, but torch's.*{complaint}"):
-            emulator.context(state)
-    for _ in range(2):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            assert torch.equal(emulator(state).position, expected.position)
-    assert find_engine(emulator, state, emulator.solid(state)).name == ("torch" if complaint else "triton")
-
-
-class WrongGradient(torch.autograd.Function):
-    """Of a path, larger than it is by a tenth."""
-
-    @staticmethod
-    def forward(ctx, path):
-        return path.clone()
-
-    @staticmethod
-    def backward(ctx, slope):
-        return 1.1 * slope
-
-
-def test_trainings_are_left_to_torch_where_gradients_differ(monkeypatch):
-    class Kernels(TorchEngine):
-        def path(self, start, output, context):
-            return WrongGradient.apply(super().path(start, output, context))
-
-    made = SimpleNamespace(TritonTraining=Kernels)
-    monkeypatch.setitem(sys.modules, "nmpm.emulator.engines.triton.training", made)
-    on_gpu(monkeypatch)
-    emulator, state = moving(box()).train().requires_grad_(), state_of(box())
-    with pytest.warns(UserWarning, match=r"Kernels in Triton are not used on cpu.*gradients of positions differ by"):
-        assert find_engine(emulator, state, emulator.solid(state)).name == "torch"
-
-
-@pytest.mark.slow
 def test_all_kernels_compile_for_a_gpu_that_need_not_be_there():
-    pytest.importorskip("triton", reason="triton is not installed")
-    command = [sys.executable, "-m", "tests.emulator.compile_kernels"]
+    command = [sys.executable, str(Path(__file__).with_name("compile_kernels.py"))]
     made = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"TRITON_INTERPRET": "0"})
     assert made.returncode == 0, made.stderr[-2000:]
     assert {line.split(":")[0] for line in made.stdout.splitlines()} >= {"flight", "flight_back", "press", "scatter"}

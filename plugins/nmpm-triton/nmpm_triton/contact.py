@@ -6,8 +6,8 @@ They compute what the torch engine's `contact` computes.
 import triton
 import triton.language as tl
 
-from nmpm.emulator.engines.triton.grid import SIZES, interpolate
-from nmpm.emulator.engines.triton.motion import confine, load, store
+from nmpm_triton.grid import SIZES, interpolate
+from nmpm_triton.motion import confine, load, store
 
 
 @triton.jit

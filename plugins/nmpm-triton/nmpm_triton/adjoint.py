@@ -6,8 +6,8 @@ What a kernel adds to a grid is summed by atomics, in no fixed order.
 import triton
 import triton.language as tl
 
-from nmpm.emulator.engines.triton.grid import LEAST, SIZES, find_nodes, load_kind
-from nmpm.emulator.engines.triton.motion import load, load_bounds, store
+from nmpm_triton.grid import LEAST, SIZES, find_nodes, load_kind
+from nmpm_triton.motion import load, load_bounds, store
 
 
 @triton.jit

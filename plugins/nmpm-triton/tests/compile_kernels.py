@@ -1,6 +1,6 @@
-"""Compile each kernel in Triton that the cases of `test_gpu` launch, for an NVIDIA GPU that need not be there.
+"""Compile each kernel that the cases of `test_triton_kernels` launch, for an NVIDIA GPU that need not be there.
 
-python -m tests.emulator.compile_kernels          prints a line for each, and exits with an error for one that fails
+python plugins/nmpm-triton/tests/compile_kernels.py   prints a line for each, and exits with an error for one that fails
 """
 
 import inspect
@@ -15,9 +15,10 @@ from triton.runtime.jit import JITFunction
 
 os.environ["TRITON_INTERPRET"] = "0"  # read where kernels are defined, which are imported below
 
-from nmpm.emulator.engines import ENGINES
-from nmpm.emulator.engines.triton import launch
-from tests.emulator.test_gpu import CASES, TRAININGS, gradients_of, moving, state_of
+from nmpm_triton import launch
+from nmpm_triton.engine import TritonEngine
+from nmpm_triton.training import TritonTraining
+from test_triton_kernels import CASES, TRAININGS, gradients_of, moving, state_of
 
 TARGET = GPUTarget("cuda", 80, 32)  # Ampere; newer GPUs take what it takes
 TYPES = {
@@ -51,12 +52,12 @@ def main() -> None:
         emulator, state = moving(scene, **form), state_of(scene, **motion)
         with torch.no_grad():
             for launch.ONE_PROGRAM in (4096, 0):
-                ENGINES["triton"](emulator).predict(state, emulator.surroundings(state, emulator.budget(state)))
+                TritonEngine(emulator).predict(state, emulator.surroundings(state, emulator.budget(state)))
     for scene, form, motion in TRAININGS.values():
         emulator, state = moving(scene, **form).train().requires_grad_(), state_of(scene, **motion)
         for is_on in (False, True):
             with torch.autocast("cpu", torch.bfloat16, enabled=is_on):
-                gradients_of(ENGINES["triton training"](emulator), emulator, state)
+                gradients_of(TritonTraining(emulator), emulator, state)
     sys.stdout.write(f"{len(_compiled)} kernels\n")
 
 

@@ -6,8 +6,8 @@ Arrays as in `motion`.
 import triton
 import triton.language as tl
 
-from nmpm.emulator.engines.triton.grid import SIZES, interpolate
-from nmpm.emulator.engines.triton.motion import confine, load, store
+from nmpm_triton.grid import SIZES, interpolate
+from nmpm_triton.motion import confine, load, store
 
 
 @triton.jit

@@ -16,12 +16,12 @@ from torch.library import triton_op, wrap_triton
 from nmpm.emulator.bundle import RolloutContext
 from nmpm.emulator.engines.torch.advection import BundleStart
 from nmpm.emulator.engines.torch.engine import TorchEngine
-from nmpm.emulator.engines.triton import launch
-from nmpm.emulator.engines.triton.adjoint import flight_back, rasterise_back
-from nmpm.emulator.engines.triton.grid import fill_state, scatter
-from nmpm.emulator.engines.triton.launch import axes, blocks, decoding, programs, walls
-from nmpm.emulator.engines.triton.motion import flight
 from nmpm.particles import Particles
+from nmpm_triton import launch
+from nmpm_triton.adjoint import flight_back, rasterise_back
+from nmpm_triton.grid import fill_state, scatter
+from nmpm_triton.launch import axes, blocks, decoding, programs, walls
+from nmpm_triton.motion import flight
 
 
 class TritonTraining(TorchEngine):
