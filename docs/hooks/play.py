@@ -17,7 +17,7 @@ from mkdocs.structure.files import File, Files
 from torch import Tensor
 
 from nmpm import Zoo
-from nmpm.play.limits import Limits
+from nmpm.play.limits import SceneLimits
 from nmpm.play.pictures import describe_played
 from nmpm.viz.page import make_page, read_asset
 from nmpm.zoo import Pretrained
@@ -53,7 +53,7 @@ def page_files(runtime: str) -> dict[str, str | bytes]:
 
 def described(model: Pretrained, runtime: str) -> dict[str, Any]:
     """What the page's scripts read of the scene, its start and the runtime."""
-    state, limits = model.example(SEED), Limits(model)
+    state, limits = model.example(SEED), SceneLimits(model)
     limits.most_particles = MOST
     return describe_played(
         model,

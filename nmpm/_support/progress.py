@@ -27,14 +27,14 @@ _ACTIVE: ContextVar[Progress | None] = ContextVar("_ACTIVE", default=None)
 """The bar that is shown now; a bar within it is another line of it."""
 
 
-class Step(Protocol):
+class Advance(Protocol):
     """Counts finished steps; `what` is done now, if that has changed."""
 
     def __call__(self, what: str = "", by: int = 1) -> object: ...
 
 
 @contextmanager
-def progress_bar(what: str, total: int | None, done: int = 0) -> Iterator[Step]:
+def progress_bar(what: str, total: int | None, done: int = 0) -> Iterator[Advance]:
     """Shows how much is done and the time left; on terminals it vanishes at the end.
 
     `what` describes the work of `total` steps, None where that is unknown, of which some are `done` already. Yields a

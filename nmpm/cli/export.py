@@ -72,7 +72,7 @@ class Export(ModelOptions, DeviceOptions):
         out, model = self._file, load_model(self.model, root=self.root)
         emulator = model.emulator.unconstrained() if self.free else model.emulator
         kind = export.Network if self.processor else export.Solid if self.solid else export.Step
-        part: export.Part = kind(emulator).to(find_device(self.device))
+        part: export.ExportedPart = kind(emulator).to(find_device(self.device))
         form = export.FORMATS[self.format]
         training_data = f"{model.card.get('dataset', 'not stated')}. {model.card.get('about', '')}".strip()
         difference = form.write_verified(part, export.description(part, self.model, training_data), out)

@@ -91,7 +91,7 @@ class Card(_ZooCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Match(_ZooCommand, ReadingOptions, FactOptions):
+class MatchModels(_ZooCommand, ReadingOptions, FactOptions):
     """Predict a few windows of your data by every model: which to use, and to start a fine-tuning from.
 
     Args:
@@ -316,7 +316,7 @@ class ZooCommands(Command):
     commands: ClassVar[Mapping[str, type[Command]]] = {
         "list": List,
         "card": Card,
-        "match": Match,
+        "match": MatchModels,
         "add": Add,
         "verify": Verify,
         "refresh": Refresh,

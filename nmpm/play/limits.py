@@ -24,7 +24,7 @@ _FILLED = 0.8
 LARGEST_SEED = 2**31 - 1
 
 
-class Limits:
+class SceneLimits:
     """The limits of a model's scenes.
 
     Attributes:

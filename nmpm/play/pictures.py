@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nmpm.obstacles import Body
-from nmpm.play.limits import Limits
+from nmpm.play.limits import SceneLimits
 from nmpm.scene import Scene
 from nmpm.viz.page import describe_scene, quantize
 
@@ -50,7 +50,9 @@ def describe_bodies(bodies: Mapping[int, Body]) -> str:
     return json.dumps({"bodies": described})
 
 
-def describe_played(model: Pretrained, limits: Limits, static: Tensor, *, title: str, **facts: Any) -> dict[str, Any]:
+def describe_played(
+    model: Pretrained, limits: SceneLimits, static: Tensor, *, title: str, **facts: Any
+) -> dict[str, Any]:
     """What the page's scripts read of a model's scene with static obstacles (1, M, D), and further facts."""
     scene = model.scene
     low, high = np.array(scene.domain).T

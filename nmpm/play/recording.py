@@ -21,7 +21,7 @@ MOST_BYTES = 2**27
 _FEWEST = 3
 
 
-class Recording:
+class PlayedFrames:
     """The last frames that were played: positions (N, D), and the bodies by id."""
 
     def __init__(self) -> None:

@@ -28,9 +28,9 @@ from nmpm.errors import ConfigError, NmpmError
 from nmpm.obstacles import Disc, Ramp
 from nmpm.play import pictures
 from nmpm.play.beside import SimulatorBeside
-from nmpm.play.limits import Limits
+from nmpm.play.limits import SceneLimits
 from nmpm.play.placing import ANGLE, Jet, Movable, Pour, block, moved, new_body, push, with_room
-from nmpm.play.recording import Recording, free_name
+from nmpm.play.recording import PlayedFrames, free_name
 from nmpm.play.world import World, first_frame, simulator_of
 from nmpm.zoo.states import StateBuilder
 
@@ -60,7 +60,7 @@ class Session:
 
     def __init__(self, model: Pretrained, seed: int, out: Path) -> None:
         self.model, self.scene, self.out = model, model.scene, out
-        self.limits = Limits(model)
+        self.limits = SceneLimits(model)
         self.playing, self.pace = True, 1
         self._preset, self._thread = simulator_of(model), ThreadPoolExecutor(1)
         self._beside: SimulatorBeside | None = None
@@ -193,7 +193,7 @@ class Session:
         """Start from the scene of a seed."""
         self.limits.check_seed(seed)
         self.world = World(self.model.emulator, *first_frame(self.model, seed), self._thread)
-        self.seed, self.frame, self.recording = seed, 0, Recording()
+        self.seed, self.frame, self.recording = seed, 0, PlayedFrames()
         self._jet = Jet(self.scene.particle_spacing, self.scene.dt)
         self._show_all()
         self._scene_changed()

@@ -51,83 +51,7 @@ TRUSTED = "trusted"
 
 
 @dataclass(frozen=True)
-class Predictor:
-    """An emulator and what its card states about its rollouts; the base of `Pretrained`."""
-
-    emulator: Emulator
-    card: Mapping[str, Any]
-
-    @property
-    def nudge(self) -> float:
-        """Standard deviation of the displacements of members' starts, in cells: the card's, else the emulator's."""
-        stated = stated_nudge(self.card)
-        return nudge_of(self.emulator, None) if stated is None else stated
-
-    @property
-    def trust(self) -> Trust:
-        """When members disagree so much that a rollout is one of many: as calibrated, see the card, or the default."""
-        return Trust.from_card(self.card.get("trust"))
-
-    def rollout(
-        self, state: Particles, frames: int, prescribed: Prescribed | None = None,
-        members: int | None = None, seed: int = 0, nudge: float | None = None,
-        until: str | None = None,
-    ) -> Tensor:  # fmt: skip
-        """Predict positions (B, frames, N, D) in domain length from a state, whose own frame is not among them.
-
-        Args:
-            state: From `state`, or a window's `initial`; several of any size at once by `Particles.stack`.
-            frames: How many.
-            prescribed: Obstacles that move, `Prescribed.obstacles(positions)`, or particles that enter and leave too,
-                `Prescribed.of(window)`. Positions of particles that are not there are NaN, as are those of particles
-                that have left through an open axis.
-            members: So many rollouts of each scene, (M, B, frames, N, D), see `nmpm.emulator.members`: by the noise
-                that the model was trained with, or else from nudged starts. None for one, (B, frames, N, D).
-            seed: Of members: each depends on it, its number and its scene, not on how many there are.
-            nudge: Standard deviation of the displacements of members' starts in cells; `model.nudge` if left out.
-            until: "trusted" to end with the last frame that is trusted, see `nmpm.emulator.trust`. Of several scenes
-                the last of all; those that are lost before are NaN from then on. A single rollout is compared with two
-                that start nearby, which costs three times the time.
-
-        Raises:
-            ConfigError: if a number is too small, a nudge is given without members, or `until` is another word.
-
-        Warns:
-            UserWarning: if particles start outside of the bounds, into which the first frame moves them.
-        """
-        return self.predict(state, frames, prescribed, members, seed, nudge, until).position
-
-    def predict(
-        self, state: Particles, frames: int, prescribed: Prescribed | None = None,
-        members: int | None = None, seed: int = 0, nudge: float | None = None,
-        until: str | None = None,
-    ) -> Rollout:  # fmt: skip
-        """As `rollout`, with the particles' evolving fields beside their positions, and the last trusted frames."""
-        if until not in (None, TRUSTED):
-            raise ConfigError(f"until = {until!r}: a rollout ends after its frames (None) or until={TRUSTED!r}.")
-        if nudge is not None and members is None:
-            raise ConfigError(f"nudge = {nudge!r} displaces the starts of members: give members=8, too.")
-        there, given = state.to(self.emulator.device), prescribed and prescribed.to(self.emulator.device)
-        warn_of_start_outside(self.emulator, there)
-        size = self.nudge if nudge is None else nudge
-        tracker = None if until is None else TrustTracker(self.emulator.scene, there, self.trust)
-        options = RolloutOptions(
-            given, members=members, seed=seed, nudge=size, tracker=tracker, until_trusted=until is not None
-        )
-        return predict_rollout(self.emulator, there, frames, options)
-
-    def differentiable_rollout(self, state: Particles, frames: int) -> Tensor:
-        """As `rollout`, with gradients to the state, see `nmpm.emulator.differentiable_rollout`.
-
-        Memory grows by one state per bundle; backward passes compute each bundle again.
-        """
-        there = state.to(self.emulator.device)
-        warn_of_start_outside(self.emulator, there)
-        return differentiable_rollout(self.emulator, there, frames)
-
-
-@dataclass(frozen=True)
-class Pretrained(Predictor):
+class Pretrained:
     """A trained model, ready to roll out or to fine-tune.
 
     Args:
@@ -136,6 +60,8 @@ class Pretrained(Predictor):
         match: How the emulator takes foreign data, once `fit_to` has made it do so.
     """
 
+    emulator: Emulator
+    card: Mapping[str, Any]
     match: Match | None = None
 
     def __repr__(self) -> str:
@@ -165,6 +91,17 @@ class Pretrained(Predictor):
     def preset(self) -> str | None:
         """Name of the simulator preset that made the training data; None for recorded or unknown data."""
         return preset_of(self.card)
+
+    @property
+    def nudge(self) -> float:
+        """Standard deviation of the displacements of members' starts, in cells: the card's, else the emulator's."""
+        stated = stated_nudge(self.card)
+        return nudge_of(self.emulator, None) if stated is None else stated
+
+    @property
+    def trust(self) -> Trust:
+        """When members disagree so much that a rollout is one of many: as calibrated, see the card, or the default."""
+        return Trust.from_card(self.card.get("trust"))
 
     @property
     def _too_fast(self) -> float:
@@ -265,6 +202,63 @@ class Pretrained(Predictor):
         if preset is None:
             return thrown_state(self.emulator, seed, THROWN if count is None else count, blocks, gravity)
         return drawn_state(self.emulator, preset, seed, gravity)
+
+    def rollout(
+        self, state: Particles, frames: int, prescribed: Prescribed | None = None,
+        members: int | None = None, seed: int = 0, nudge: float | None = None,
+        until: str | None = None,
+    ) -> Tensor:  # fmt: skip
+        """Predict positions (B, frames, N, D) in domain length from a state, whose own frame is not among them.
+
+        Args:
+            state: From `state`, or a window's `initial`; several of any size at once by `Particles.stack`.
+            frames: How many.
+            prescribed: Obstacles that move, `Prescribed.obstacles(positions)`, or particles that enter and leave too,
+                `Prescribed.of(window)`. Positions of particles that are not there are NaN, as are those of particles
+                that have left through an open axis.
+            members: So many rollouts of each scene, (M, B, frames, N, D), see `nmpm.emulator.members`: by the noise
+                that the model was trained with, or else from nudged starts. None for one, (B, frames, N, D).
+            seed: Of members: each depends on it, its number and its scene, not on how many there are.
+            nudge: Standard deviation of the displacements of members' starts in cells; `model.nudge` if left out.
+            until: "trusted" to end with the last frame that is trusted, see `nmpm.emulator.trust`. Of several scenes
+                the last of all; those that are lost before are NaN from then on. A single rollout is compared with two
+                that start nearby, which costs three times the time.
+
+        Raises:
+            ConfigError: if a number is too small, a nudge is given without members, or `until` is another word.
+
+        Warns:
+            UserWarning: if particles start outside of the bounds, into which the first frame moves them.
+        """
+        return self.predict(state, frames, prescribed, members, seed, nudge, until).position
+
+    def predict(
+        self, state: Particles, frames: int, prescribed: Prescribed | None = None,
+        members: int | None = None, seed: int = 0, nudge: float | None = None,
+        until: str | None = None,
+    ) -> Rollout:  # fmt: skip
+        """As `rollout`, with the particles' evolving fields beside their positions, and the last trusted frames."""
+        if until not in (None, TRUSTED):
+            raise ConfigError(f"until = {until!r}: a rollout ends after its frames (None) or until={TRUSTED!r}.")
+        if nudge is not None and members is None:
+            raise ConfigError(f"nudge = {nudge!r} displaces the starts of members: give members=8, too.")
+        there, given = state.to(self.emulator.device), prescribed and prescribed.to(self.emulator.device)
+        warn_of_start_outside(self.emulator, there)
+        size = self.nudge if nudge is None else nudge
+        tracker = None if until is None else TrustTracker(self.emulator.scene, there, self.trust)
+        options = RolloutOptions(
+            given, members=members, seed=seed, nudge=size, tracker=tracker, until_trusted=until is not None
+        )
+        return predict_rollout(self.emulator, there, frames, options)
+
+    def differentiable_rollout(self, state: Particles, frames: int) -> Tensor:
+        """As `rollout`, with gradients to the state, see `nmpm.emulator.differentiable_rollout`.
+
+        Memory grows by one state per bundle; backward passes compute each bundle again.
+        """
+        there = state.to(self.emulator.device)
+        warn_of_start_outside(self.emulator, there)
+        return differentiable_rollout(self.emulator, there, frames)
 
     def with_network(self, precision: str) -> Pretrained:
         """The same model with the network's weights in "float32" or, faster on most processors, in "bfloat16"."""

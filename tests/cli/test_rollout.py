@@ -15,7 +15,7 @@ from nmpm.data.simulation import generate
 from nmpm.emulator.trust import Trust
 from nmpm.sim import load_preset
 from nmpm.viz.files import read_labelled
-from nmpm.zoo.pretrained import Predictor
+from nmpm.zoo.pretrained import Pretrained
 
 
 @pytest.fixture(autouse=True)
@@ -174,7 +174,7 @@ def test_a_rollout_ends_with_the_last_trusted_frame(folder, monkeypatch, capsys)
     few = ["rollout", "goop", "--frames", "24", "--particles", "100"]
     assert main([*few, "--out", "full.h5"]) == 0 == main([*few, "--until", "trusted", "--out", "all.h5"])
     assert "Trusted for all 24 frames" in capsys.readouterr().out
-    monkeypatch.setattr(Predictor, "trust", Trust(limit=0.02, error=0.25, scenes=8))
+    monkeypatch.setattr(Pretrained, "trust", Trust(limit=0.02, error=0.25, scenes=8))
     assert main([*few, "--until", "trusted", "--out", "some.h5"]) == 0
     said = capsys.readouterr().out
     full, whole, some = (Split(folder / f"{name}.h5").read(0).position for name in ("full", "all", "some"))
@@ -183,7 +183,7 @@ def test_a_rollout_ends_with_the_last_trusted_frame(folder, monkeypatch, capsys)
     assert 0 < last < 24
     np.testing.assert_array_equal(whole, full)
     np.testing.assert_array_equal(some, full[: len(some)])
-    monkeypatch.setattr(Predictor, "trust", Trust(limit=1e-9))
+    monkeypatch.setattr(Pretrained, "trust", Trust(limit=1e-9))
     for words, message in (
         ([*few, "--until", "trusted"], "--until trusted: no frame is."),
         ([*few, "--until", "trusted", "--members", "2"], "leave --members out"),

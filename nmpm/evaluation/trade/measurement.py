@@ -16,7 +16,7 @@ import torch
 
 from nmpm._support.atomic import atomic_write
 from nmpm._support.messages import one_line
-from nmpm._support.progress import Step, progress_bar
+from nmpm._support.progress import Advance, progress_bar
 from nmpm.emulator.prescribed import with_predicted
 from nmpm.errors import NmpmError
 from nmpm.evaluation.machine import clock_for, describe_device, is_machine_failure, one_thread, peak_bytes
@@ -130,7 +130,7 @@ def _point(scenes: Scenes, choice: Choice, rows: Sequence[Mapping[str, Any]], ti
 
 
 def measure_accuracy(
-    choice: Choice, scenes: Scenes, measures: Measures, store: Store, step: Step
+    choice: Choice, scenes: Scenes, measures: Measures, store: Store, step: Advance
 ) -> list[dict[str, Any]]:
     """Rows of `_measure_scene`, computed where the store lacks them; calls `step` after every scene."""
     key = _errors_key(choice, measures)
@@ -185,7 +185,9 @@ class _Runner:
     warm: bool = False
 
 
-def measure_times(choices: Sequence[Choice], scenes: Scenes, timing: Timing, store: Store, step: Step) -> list[Times]:
+def measure_times(
+    choices: Sequence[Choice], scenes: Scenes, timing: Timing, store: Store, step: Advance
+) -> list[Times]:
     """The times of all choices; those that lack a round take turns in it, in an order that changes.
 
     Round r predicts scene r, and the next ones where a choice takes several at once; `step` is called after each run.

@@ -12,7 +12,7 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.trainer.states import TrainerFn
 
-from nmpm._support.progress import Step, progress_bar
+from nmpm._support.progress import Advance, progress_bar
 from nmpm.evaluation.figures import with_unit
 from nmpm.training.budget import seconds_left, total_steps
 
@@ -28,7 +28,7 @@ class Progress(ProgressBar):
         super().__init__()
         self._enabled = True
         self._open_bar = ExitStack()
-        self._advance: Step | None = None
+        self._advance: Advance | None = None
         self._steps = 0  # that the bar shows
         self._first_step, self._start = 0, math.nan  # when this process began to train
         self._loss = self._error = ""

@@ -28,7 +28,7 @@ from nmpm._support.messages import install
 from nmpm._support.progress import progress_bar
 from nmpm.errors import ConfigError, DataError
 from nmpm.transfer import without_kernels
-from nmpm.zoo.export.parts import VARYING, Part, Value
+from nmpm.zoo.export.parts import VARYING, ExportedPart, Value
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -47,10 +47,10 @@ class Format:
         run: Gives the outputs of a file for inputs by name.
     """
 
-    write: Callable[[Part, Mapping[str, str], Path], None]
+    write: Callable[[ExportedPart, Mapping[str, str], Path], None]
     run: Callable[[Path, Mapping[str, Tensor]], tuple[Tensor, ...]]
 
-    def write_verified(self, part: Part, metadata: Mapping[str, str], path: Path) -> float:
+    def write_verified(self, part: ExportedPart, metadata: Mapping[str, str], path: Path) -> float:
         """Write a part, and compare the file with it; the largest difference, see `difference`.
 
         Raises:
@@ -69,7 +69,7 @@ class Format:
             )
         return difference
 
-    def difference(self, part: Part, path: Path, batch: int, count: int, seed: int = 0) -> float:
+    def difference(self, part: ExportedPart, path: Path, batch: int, count: int, seed: int = 0) -> float:
         """The largest difference between a written file's outputs and the part's own, on random inputs.
 
         In cells for the step, else in the output's own units; inf where either is NaN.
@@ -82,7 +82,7 @@ class Format:
         return worst
 
 
-def description(part: Part, model: str, training_data: str) -> dict[str, str]:
+def description(part: ExportedPart, model: str, training_data: str) -> dict[str, str]:
     """Metadata of an exported file, as keys and texts: the model's name, its data in words, and what it computes."""
     emulator = part.emulator
     return {
@@ -104,7 +104,7 @@ def description(part: Part, model: str, training_data: str) -> dict[str, str]:
     }
 
 
-def _trace(part: Part) -> ExportedProgram:
+def _trace(part: ExportedPart) -> ExportedProgram:
     """The program of a part, whose sizes B, N and M are left open.
 
     Raises:
@@ -122,7 +122,7 @@ def _trace(part: Part) -> ExportedProgram:
         ) from error
 
 
-def _network_name(part: Part) -> str:
+def _network_name(part: ExportedPart) -> str:
     return type(part.emulator.recipe.processor).__name__
 
 
@@ -137,7 +137,7 @@ def _reason(error: BaseException) -> str:
 # ---- ONNX
 
 
-def write_onnx(part: Part, metadata: Mapping[str, str], path: Path) -> None:
+def write_onnx(part: ExportedPart, metadata: Mapping[str, str], path: Path) -> None:
     """Write a part as an ONNX file; ConfigError names a missing package, or an operation that ONNX lacks."""
     _check_onnx()
     import onnx
@@ -220,7 +220,7 @@ def _name_sizes(model: ModelProto, values: tuple[Value, ...]) -> None:
 # ---- AOTInductor
 
 
-def write_compiled(part: Part, metadata: Mapping[str, str], path: Path) -> None:
+def write_compiled(part: ExportedPart, metadata: Mapping[str, str], path: Path) -> None:
     """Write a part as a package of AOTInductor, for the device that the part is on; the name must end in .pt2.
 
     Raises:

@@ -42,7 +42,7 @@ class Value:
     scale: float = 1.0
 
 
-class Part(nn.Module, ABC):
+class ExportedPart(nn.Module, ABC):
     """An exportable function of named float32 tensors, with a copy of the emulator on the CPU; `to` moves it.
 
     Args:
@@ -73,7 +73,7 @@ class Part(nn.Module, ABC):
         """Random inputs on the part's device, for tracing and comparing: of scenes, and particles of each kind."""
 
 
-class Step(Part):
+class Step(ExportedPart):
     """One call of the emulator: from a state to the next m frames and the state after them.
 
     Raises:
@@ -156,7 +156,7 @@ class Step(Part):
         return {value.name: values[value.name].to(self.device) for value in self.inputs}
 
 
-class Network(Part):
+class Network(ExportedPart):
     """The network between the transfers with its normalisation: from a grid state to m grid velocity fields."""
 
     features = frozenset({"bounds: error"})
@@ -185,7 +185,7 @@ class Network(Part):
         return {"grid": emulator.input_mean + emulator.input_std * noise}
 
 
-class Solid(Part):
+class Solid(ExportedPart):
     """From obstacle particles to the solid fraction that the step takes.
 
     Raises:
