@@ -177,7 +177,7 @@ class Emulator(nn.Module):
         other._set_engine(name, self.recipe)
         if ENGINES[name] and not other.engine_forms:
             missing = lacks(MODELS, self.recipe, ENGINES[name][0].features)
-            raise ConfigError(f"The engine {name} does not compute {', '.join(missing)}.")
+            raise ConfigError(f"The engine {name} does not take {', '.join(missing)}.")
         return other
 
     def with_constraints(self, constraints: Constraints) -> Emulator:

@@ -87,7 +87,7 @@ def _with_engine(emulator: Emulator, name: str) -> Emulator:
     """The emulator with an engine that takes its rollouts here, and whose results are torch's."""
     other, reference = emulator.with_engine(name), emulator.with_engine("torch")
     if missing := min((missing_features(emulator, form, False) for form in ENGINES[name]), key=len, default=[]):
-        raise ConfigError(f"The engine {name} does not compute {', '.join(missing)}: use the runtime eager.")
+        raise ConfigError(f"The engine {name} does not take {', '.join(missing)}: use the runtime eager.")
     try:
         state = _check_deviation(f"engine {name}", reference, other, small_example(emulator))
         paths = [_positions(form, state) for form in (reference, other)]

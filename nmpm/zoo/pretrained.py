@@ -311,10 +311,11 @@ class Pretrained:
         grid, in a second or two, for as many threads as torch then has. This model is left as it is.
 
         Args:
-            runtime: One of `nmpm.emulator.runtimes.RUNTIMES`, by name or made with options: "openvino" (CPU, needs
-                extra `openvino`), "windows" (large scenes that are mostly empty), or "eager", torch itself; "auto" for
-                the faster of openvino and eager here, as measured in short rollouts. On a CUDA GPU calls by eager are
-                recorded as CUDA graphs without being asked.
+            runtime: One of `nmpm.backends.RUNTIMES`, by name or made with options: "openvino" (CPU, needs extra
+                `openvino`), "windows" (large scenes that are mostly empty), or "eager", torch itself; "auto" for the
+                faster of openvino and eager here, as measured in short rollouts; or the name of one of `ENGINES` there,
+                which computes all else of a call. On a CUDA GPU calls by eager are recorded as CUDA graphs without
+                being asked.
             precision: As for `with_network`; the network's own if left out.
 
         Raises:

@@ -121,7 +121,7 @@ def test_another_engine_is_chosen_by_name():
     assert call_form(by_torch.with_engine("numba"), state, emulator.solid(state)).name == "numba"
     with pytest.raises(ConfigError, match=r"no engine 'nunba'; there are torch, numba.*Did you mean numba\?"):
         emulator.with_engine("nunba")
-    with pytest.raises(ConfigError, match="The engine numba does not compute other transfers"):
+    with pytest.raises(ConfigError, match="The engine numba does not take other transfers"):
         emulator_of(box(), transfer=Affine()).with_engine("numba")
 
 

@@ -128,9 +128,9 @@ def test_an_engine_of_another_package_is_used_where_it_is_asked_for(small, kerne
     assert find_engine(model.emulator, state, solid).name == "numba"
     assert 'further    `optimized("kernels")`' in model.emulator.explain()
     assert model.optimized("torch").emulator.engine == "torch"
-    with pytest.raises(ConfigError, match="The engine kernels does not compute three dimensions"):
+    with pytest.raises(ConfigError, match="The engine kernels does not take three dimensions"):
         Pretrained(emulator_of(box(3), 8), {}).optimized("kernels")
-    with pytest.raises(ConfigError, match="The engine kernels does not compute other devices: use the runtime eager"):
+    with pytest.raises(ConfigError, match="The engine kernels does not take other devices: use the runtime eager"):
         model.to("meta").optimized("kernels")
 
 
