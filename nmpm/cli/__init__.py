@@ -118,7 +118,7 @@ def _main(words: list[str]) -> int:
     if "_ARGCOMPLETE" in os.environ:  # the shell asks what a line may go on with
         from nmpm.cli.completion import complete
 
-        complete()
+        complete(COMMANDS, summaries)
         return 0
     words = [expand_home(word) for word in words]
     if not words or words[0] in ("-h", "--help", "help"):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import argcomplete
@@ -12,22 +12,22 @@ from argcomplete.completers import FilesCompleter
 from argcomplete.lexers import split_line
 
 from nmpm._support.shipped import config_names, entry_names, preset_names, shipped_folder, user_zoo
-from nmpm.cli import COMMANDS, summaries
-from nmpm.cli.command import command_parser
+from nmpm.cli.command import Command, command_parser
+from nmpm.registry import Registry
 
 
-def complete() -> None:
+def complete(commands: Registry[type[Command]], summaries: Callable[[], Mapping[str, str]]) -> None:
     """Write what the shell's line in COMP_LINE may go on with, for the shell, and exit."""
     line, point = os.environ["COMP_LINE"], int(os.environ["COMP_POINT"])
     words = split_line(line, point)[3][1:]
-    if not words or words[0] not in COMMANDS:
+    if not words or words[0] not in commands:
         parser = argparse.ArgumentParser(prog="nmpm")
-        commands = parser.add_subparsers()
+        added = parser.add_subparsers()
         for name, summary in summaries().items():
-            commands.add_parser(name, help=summary)
+            added.add_parser(name, help=summary)
         argcomplete.autocomplete(parser, always_complete_options=False)
     os.environ["_ARGCOMPLETE"] = "2"  # the command's name belongs to the program
-    command, prog = COMMANDS[words[0]], f"nmpm {words[0]}"
+    command, prog = commands[words[0]], f"nmpm {words[0]}"
     if len(words) > 1 and words[1] in command.commands:
         os.environ["_ARGCOMPLETE"] = "3"
         command, prog = command.commands[words[1]], f"{prog} {words[1]}"

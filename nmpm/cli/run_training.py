@@ -244,7 +244,8 @@ class EmulatorCLI(LightningCLI):
         for logger in self.trainer.loggers:
             check_folder("The logger's save_dir", Path(logger.save_dir or "."))
         check_disk(self.trainer, self.model)
-        check_memory(self.trainer, self.model, self.datamodule.batch_size)
+        bundles = 1 if self.model.recompute else self.model.unroll
+        check_memory(self.trainer, self.model.emulator, bundles, self.datamodule.batch_size)
         resumed = self._load_checkpoint()
         if resumed is not None:
             self.model.adopt_arguments(resumed)  # refuses another optimizer before data are simulated

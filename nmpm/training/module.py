@@ -207,7 +207,7 @@ class EmulatorModule(LightningModule):
                 f" TrajectoryDataModule horizon={frames}, or unroll less."
             )
         if stage == TrainerFn.FITTING and isinstance(data, TrajectoryDataModule):
-            preflight.check_evaluations(self.trainer, self, data)
+            preflight.check_evaluations(self.trainer, self, self.valid_errors, self.test_errors, data)
 
     def on_fit_start(self) -> None:
         """Compile the network, once the strategy has moved it to the device."""

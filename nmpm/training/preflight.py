@@ -13,7 +13,6 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from lightning.pytorch import LightningModule, Trainer
@@ -39,12 +38,10 @@ from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.grid_rule import MULTIPLE, TrainingSize, grid_shape
 from nmpm.data.recordings import SplitRecordings
 from nmpm.data.windows import collate
+from nmpm.emulator import Emulator
 from nmpm.errors import ConfigError, NmpmError
 from nmpm.evaluation.comparison import Comparison, still
 from nmpm.processors import GridProcessor, UNet
-
-if TYPE_CHECKING:
-    from nmpm.training.module import EmulatorModule
 
 _LOG = logging.getLogger(__name__)
 OVERALL = "overall"
@@ -165,20 +162,22 @@ def _check_precision(trainer: Trainer) -> None:
 # Evaluations and monitored errors
 
 
-def check_evaluations(trainer: Trainer, module: EmulatorModule, data: TrajectoryDataModule) -> None:
-    """Compute the metrics on a trajectory of each split, and look for the errors that callbacks monitor.
+def check_evaluations(
+    trainer: Trainer, module: LightningModule, valid: Comparison, test: Comparison, data: TrajectoryDataModule
+) -> None:
+    """Compute the metrics of validations and tests on a trajectory, and look for the errors that callbacks monitor.
 
     Raises:
         ConfigError: where Lightning would fail in the first validation, or after the training.
     """
     if trainer.enable_validation:
         _check_share("limit_val_batches", trainer.limit_val_batches, len(data.val_dataloader()))
-        errors = _try_metrics(module.valid_errors, data.recordings("valid"))
+        errors = _try_metrics(valid, data.recordings("valid"))
         _check_monitors(trainer, module, {*errors, OVERALL})
     if data.has_test and trainer.limit_test_batches:
         _check_share("limit_test_batches", trainer.limit_test_batches, len(data.test_dataloader()))
         # Two frames and one to predict: the metrics of a test may take minutes for a whole trajectory.
-        _try_metrics(module.test_errors, data.recordings("test"), frames=3)
+        _try_metrics(test, data.recordings("test"), frames=3)
 
 
 def _check_share(option: str, share: float, batches: int) -> None:
@@ -189,7 +188,7 @@ def _check_share(option: str, share: float, batches: int) -> None:
         )
 
 
-def _check_monitors(trainer: Trainer, module: EmulatorModule, errors: set[str]) -> None:
+def _check_monitors(trainer: Trainer, module: LightningModule, errors: set[str]) -> None:
     """Raise ConfigError if what callbacks monitor is never logged; the user's callbacks or module may log anything."""
     if not all(type(part).__module__.startswith(PACKAGES) for part in (module, *_callbacks(trainer))):
         return
@@ -227,24 +226,24 @@ def _try_metrics(errors: Comparison, recordings: SplitRecordings, frames: int | 
 # Memory and disk space
 
 
-def check_memory(trainer: Trainer, module: EmulatorModule, batch_size: int) -> None:
-    """Raise ConfigError, with a grid that fits, if the activations of a U-Net on the CPU would not fit into memory."""
-    recipe, scene = module.emulator.recipe, module.emulator.scene
+def check_memory(trainer: Trainer, emulator: Emulator, bundles: int, batch_size: int) -> None:
+    """Raise ConfigError, with a grid that fits, if a U-Net's activations do not fit into the memory."""
+    recipe, scene = emulator.recipe, emulator.scene
     if trainer.strategy.root_device.type != "cpu" or not isinstance(recipe.processor, UNet):
         return
-    size = TrainingSize(batch_size, 1 if module.recompute else module.unroll, recipe.processor.width)
+    size = TrainingSize(batch_size, bundles, recipe.processor.width)
     free = free_memory()
 
     def fits(shape: Sequence[int]) -> bool:
         return size.memory(shape) <= MEMORY_MARGIN * free
 
-    if fits(module.emulator.grid.shape):
+    if fits(emulator.grid.shape):
         return
-    numbers = range(MULTIPLE, max(module.emulator.grid.shape), MULTIPLE)
+    numbers = range(MULTIPLE, max(emulator.grid.shape), MULTIPLE)
     smaller = [cells for cells in numbers if fits(grid_shape(scene.domain, scene.periodic, cells))]
-    shape = " x ".join(map(str, module.emulator.grid.shape))
+    shape = " x ".join(map(str, emulator.grid.shape))
     raise ConfigError(
-        f"A training on {shape} cells takes about {size.memory(module.emulator.grid.shape) / 1e9:.0f} GB of memory, of"
+        f"A training on {shape} cells takes about {size.memory(emulator.grid.shape) / 1e9:.0f} GB of memory, of"
         f" which {free / 1e9:.1f} are free: give --model.cells {max(smaller, default=MULTIPLE)}, a smaller"
         f" --data.batch_size than {batch_size}, or --model.recompute true."
     )

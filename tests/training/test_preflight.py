@@ -139,8 +139,9 @@ def test_a_grid_that_does_not_fit_into_memory_is_refused_with_one_that_does(make
     trainer = lightning.Trainer(accelerator="cpu", default_root_dir=tmp_path / "run", logger=False, max_steps=1)
     monkeypatch.setattr(preflight, "free_memory", lambda: 2e9)
     with pytest.raises(ConfigError, match=r"64 x 64 x 64 cells takes about 6 GB .* give --model.cells 40"):
-        preflight.check_memory(trainer, module, batch_size=4)
-    preflight.check_memory(trainer, module_of(data, cells=40, processor=UNet(width=24, depth=3)), batch_size=4)
+        preflight.check_memory(trainer, module.emulator, bundles=module.unroll, batch_size=4)
+    small = module_of(data, cells=40, processor=UNet(width=24, depth=3))
+    preflight.check_memory(trainer, small.emulator, bundles=small.unroll, batch_size=4)
 
 
 @pytest.mark.parametrize("emulated", [True, False])

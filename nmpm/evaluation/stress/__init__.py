@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING
 from nmpm.registry import Registry
 
 if TYPE_CHECKING:
-    from nmpm.evaluation.stress.model import ModelUnderTest
-    from nmpm.evaluation.stress.results import Effort, TestResult
+    from nmpm.evaluation.stress.results import TestResult
 
 _ROOM = "nmpm.evaluation.stress"
-GROUPS: Registry[Callable[[ModelUnderTest, Effort], Iterator[TestResult]]] = Registry(
+GROUPS: Registry[Callable[..., Iterator[TestResult]]] = Registry(
     "nmpm.stress",
     "group of stress tests",
     {
@@ -31,3 +30,4 @@ GROUPS: Registry[Callable[[ModelUnderTest, Effort], Iterator[TestResult]]] = Reg
         "free": f"{_ROOM}.unconstrained:network_alone",
     },
 )
+"""Each a function of a `ModelUnderTest` and an `Effort`."""
