@@ -86,7 +86,8 @@ class Convert(FactOptions):
         sys.stdout.write(f"wrote {self.destination}; to look at it: {look}\n")
 
     def _export(self) -> None:
-        from nmpm.data.convert.conversion import export, open_complete, renumber_types
+        from nmpm.data.convert import open_complete
+        from nmpm.data.convert.conversion import export, renumber_types
         from nmpm.data.write import find_writer
 
         writer, source = find_writer("DESTINATION", self.destination), self.source.resolve()

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal, get_args
 
 import torch
 from lightning.pytorch import LightningDataModule
@@ -16,12 +17,15 @@ from nmpm.data.batches import PlanStart, RecordingProvider, TrajectoryBuffer, Wi
 from nmpm.data.convert import Options
 from nmpm.data.format import split_paths
 from nmpm.data.recordings import EvaluationLoader, SplitRecordings
-from nmpm.data.sources import SourceName, hold_out, make_source
+from nmpm.data.sources import DataSource, FolderSource, HubSource, hold_out
 from nmpm.data.windows import check_observed, pin_for
 from nmpm.errors import ConfigError
 from nmpm.particles import Window
 from nmpm.scene import Boundary, Reading, Scene
 
+SourceName = Literal["disk", "simulate", "hub"]
+
+_OPEN = "???"  # OmegaConf's for a value that is still to be given
 _GPU_SHARE = 0.25  # of the free GPU memory that the buffer may use; the rest is for the model
 
 
@@ -115,7 +119,7 @@ class TrajectoryDataModule(LightningDataModule):
         super().__init__()
         facts = {"prescribed": prescribed, "bounds": bounds, "gravity": gravity, "boundary": boundary, "fields": fields}
         options = Options.of(facts | {"family": family, "resample": resample, "smooth": smooth, "files": files})
-        self.data_source = make_source(path, name, source, options, generate)
+        self.data_source = _make_source(path, name, source, options, generate)
         if reading is not None:
             self.reading = from_plain(Reading, reading, "data.reading")
         for key, value in (("horizon", horizon), ("eval_batch_size", eval_batch_size), ("limit_eval", limit_eval)):
@@ -288,3 +292,40 @@ class TrainingLoader:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Nothing to restore."""
+
+
+def _make_source(
+    path: str | None, name: str | None, source: SourceName, options: Options, generate: Mapping[str, Any] | None
+) -> DataSource:
+    """The source that the arguments of `TrajectoryDataModule` mean; a ConfigError if they contradict each other."""
+    if path == _OPEN and name is None:
+        raise ConfigError("data.path is not set, the configuration leaves it open (???): give --data.path FOLDER.")
+    if path is None and name is None:
+        raise ConfigError(
+            "Neither data.path nor data.name is set: give --data.path FOLDER, or --data.name and an embedded dataset"
+            " (nmpm simulate --list)."
+        )
+    if source not in get_args(SourceName):
+        raise ConfigError(f"source = {source} is not one of {', '.join(get_args(SourceName))}.")
+    if path is not None and path != _OPEN:
+        if source != "disk":
+            raise ConfigError(
+                f"source = {source} needs the `name` of a dataset, not the path {path}; for the path, --data.source"
+                " disk."
+            )
+        return FolderSource(Path(path), options)
+    if source == "hub":
+        _refuse({"generate": generate}, f"the published dataset {name}")
+        return HubSource(Path(str(name)), options)
+    _refuse(vars(options), f"the simulated dataset {name}")
+    from nmpm.data.simulated_sources import EmbeddedSource, SimulatedSource  # imports simulators
+
+    kind = SimulatedSource if source == "simulate" else EmbeddedSource
+    return kind(str(name), dict(generate or {}))
+
+
+def _refuse(arguments: Mapping[str, Any], data: str) -> None:
+    wrong = [key for key, value in arguments.items() if value is not None]
+    if wrong:
+        mend = " ".join(f"--data.{key} null" for key in wrong)
+        raise ConfigError(f"{', '.join(wrong)} cannot be combined with {data}; leave it out: {mend}.")

@@ -12,8 +12,8 @@ import numpy as np
 from nmpm._support.messages import counted
 from nmpm.data.array_checks import broken_frames, frames_at_one_point, particles_far_away, swapped_axes
 from nmpm.data.boundaries import FEW_CROSSINGS
-from nmpm.data.facts import take_sample
 from nmpm.data.metadata import FOUND
+from nmpm.data.samples import take_sample
 from nmpm.data.spacing import relative_positions
 from nmpm.data.stated import AXES
 from nmpm.data.statistics import first_moving_particle, first_outside, lengths

@@ -18,10 +18,9 @@ from nmpm.data.fields import FieldFacts, FieldSurvey, Kind
 from nmpm.data.findings import Finding, Severity, merge_findings, sort_findings
 from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, split_paths, split_renames
 from nmpm.data.grid_rule import GridCost, GridFacts, Machine, grid_cost, recommended_cells
-from nmpm.data.metadata import FOUND, load_json, parse_metadata
+from nmpm.data.metadata import FOUND, guess_family, load_json, parse_metadata
 from nmpm.data.sources import FolderSource
 from nmpm.data.spacing import neighbour_distance
-from nmpm.data.stated import guess_family
 from nmpm.data.statistics import MotionStatistics, extent_of, find_disagreements, notes_on_lengths
 from nmpm.data.survey import RecordedMotion, Survey
 from nmpm.errors import ConfigError, DataError, NmpmError

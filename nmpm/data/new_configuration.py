@@ -18,9 +18,8 @@ from nmpm.data.format import Split, find_split, split_paths
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.grid_rule import GridCost, GridFacts, Machine, TrainingSize, grid_cost, recommended_cells, training_size
 from nmpm.data.inspection import open_dataset
-from nmpm.data.metadata import FOUND
+from nmpm.data.metadata import FAMILIES, FOUND
 from nmpm.data.sources import FolderSource
-from nmpm.data.stated import FAMILIES
 from nmpm.data.survey import RecordedMotion, Survey, smoothing_frames
 from nmpm.errors import DataError
 from nmpm.scene import Scene

@@ -8,11 +8,10 @@ from __future__ import annotations
 import abc
 import shutil
 import zipfile
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, get_args
+from typing import Any
 
 from nmpm._support.atomic import lock_folder, new_folder
 from nmpm._support.bounded_files import EXPANSION, FILE_NAME, ZIP_ERRORS, expansion_limit
@@ -127,11 +126,6 @@ def _unpack_one(archive: Path, target: Path) -> None:
             unpacked_file.parent.mkdir(parents=True, exist_ok=True)
             with file.open(item) as packed, unpacked_file.open("wb") as out:
                 shutil.copyfileobj(packed, out)
-
-
-SourceName = Literal["disk", "simulate", "hub"]
-
-_OPEN = "???"  # OmegaConf's for a value that is still to be given
 
 
 @dataclass(frozen=True)
@@ -280,40 +274,3 @@ class HubSource(FolderSource):
     @cached_property
     def folder(self) -> Path:
         return native_folder(hub_folder(str(self.path)), self.options)
-
-
-def make_source(
-    path: str | None, name: str | None, source: SourceName, options: Options, generate: Mapping[str, Any] | None
-) -> DataSource:
-    """The source that the arguments of `TrajectoryDataModule` mean; a ConfigError if they contradict each other."""
-    if path == _OPEN and name is None:
-        raise ConfigError("data.path is not set, the configuration leaves it open (???): give --data.path FOLDER.")
-    if path is None and name is None:
-        raise ConfigError(
-            "Neither data.path nor data.name is set: give --data.path FOLDER, or --data.name and an embedded dataset"
-            " (nmpm simulate --list)."
-        )
-    if source not in get_args(SourceName):
-        raise ConfigError(f"source = {source} is not one of {', '.join(get_args(SourceName))}.")
-    if path is not None and path != _OPEN:
-        if source != "disk":
-            raise ConfigError(
-                f"source = {source} needs the `name` of a dataset, not the path {path}; for the path, --data.source"
-                " disk."
-            )
-        return FolderSource(Path(path), options)
-    if source == "hub":
-        _refuse({"generate": generate}, f"the published dataset {name}")
-        return HubSource(Path(str(name)), options)
-    _refuse(vars(options), f"the simulated dataset {name}")
-    from nmpm.data.simulated_sources import EmbeddedSource, SimulatedSource
-
-    kind = SimulatedSource if source == "simulate" else EmbeddedSource
-    return kind(str(name), dict(generate or {}))
-
-
-def _refuse(arguments: Mapping[str, Any], data: str) -> None:
-    wrong = [key for key, value in arguments.items() if value is not None]
-    if wrong:
-        mend = " ".join(f"--data.{key} null" for key in wrong)
-        raise ConfigError(f"{', '.join(wrong)} cannot be combined with {data}; leave it out: {mend}.")

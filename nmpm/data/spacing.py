@@ -19,7 +19,7 @@ from nmpm.errors import DataError
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-    from nmpm.data.facts import Sample
+    from nmpm.data.samples import Sample
 
 _QUERIES = 2000
 _TRAJECTORIES = 8

@@ -16,7 +16,7 @@ from nmpm.data.statistics import roundest
 from nmpm.errors import DataError
 
 if TYPE_CHECKING:
-    from nmpm.data.facts import Sample
+    from nmpm.data.samples import Sample
 
 
 _TOLERANCE = 0.02  # of a step

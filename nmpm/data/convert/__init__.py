@@ -8,10 +8,11 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from nmpm._support import __version__
 from nmpm._support.atomic import lock_folder
@@ -212,6 +213,23 @@ def native_file(path: Path, split: str | None = None, options: Options | None = 
     if split is not None and split not in paths:
         raise ConfigError(f"--split {split}: {path} has {', '.join(paths)}.")
     return paths[split] if split is not None else paths.get("test", next(iter(paths.values())))
+
+
+@contextmanager
+def open_complete(path: Path, format_name: str | None, options: Options) -> Iterator[ForeignDataset]:
+    """As `open_dataset`, with runs whole; facts that are to be found in them are found by converting them first."""
+    from nmpm.data.convert.conversion import NOTES, write_native
+
+    dataset = open_dataset(path, format_name, options)
+    if dataset.whole is not None:
+        with TemporaryDirectory() as temporary:
+            notes = write_native(dataset.whole, Path(temporary) / "whole")
+            yield replace(open_dataset(Path(temporary) / "whole"), notes=notes)
+    elif dataset.unknown:
+        native = open_dataset(native_folder(path, options, format_name))
+        yield replace(native, notes=tuple(native.metadata.extra.get(NOTES, ())))
+    else:
+        yield dataset
 
 
 def _fingerprint(path: Path, options: Options, format_name: str | None) -> str:

@@ -24,8 +24,8 @@ import numpy as np
 from nmpm._support.bounded_files import check_regular
 from nmpm._support.messages import counted, install, one_line
 from nmpm.data.format import ID, OTHER_NAMES, SPLITS, Metadata, Trajectory, is_no_data
+from nmpm.data.metadata import find_family
 from nmpm.data.stated import Options as Options
-from nmpm.data.stated import find_family
 from nmpm.errors import ConfigError, DataError, NmpmError
 
 UNKNOWN_LENGTH = 0

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import h5py
@@ -17,8 +15,7 @@ from nmpm._support.atomic import new_folder
 from nmpm._support.messages import span
 from nmpm._support.progress import progress_bar
 from nmpm.data.array_checks import check_end, swapped_axes
-from nmpm.data.convert import native_folder, open_dataset
-from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset, Options
+from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset
 from nmpm.data.facts import FactFinder
 from nmpm.data.format import SPLITS, Metadata, Split, Trajectory, write_metadata, write_split
 from nmpm.data.metadata import FOUND
@@ -257,21 +254,6 @@ class Exported:
         names = ", ".join(sorted(left_out))
         note = f"Not numbers of particles, so left out: {names}; .npz and .h5 hold all fields."
         return cls(path, files, (note,) if left_out else ())
-
-
-@contextmanager
-def open_complete(path: Path, format_name: str | None, options: Options) -> Iterator[ForeignDataset]:
-    """As `open_dataset`, with runs whole; facts that are to be found in them are found by converting them first."""
-    dataset = open_dataset(path, format_name, options)
-    if dataset.whole is not None:
-        with TemporaryDirectory() as temporary:
-            notes = write_native(dataset.whole, Path(temporary) / "whole")
-            yield replace(open_dataset(Path(temporary) / "whole"), notes=notes)
-    elif dataset.unknown:
-        native = open_dataset(native_folder(path, options, format_name))
-        yield replace(native, notes=tuple(native.metadata.extra.get(NOTES, ())))
-    else:
-        yield dataset
 
 
 def export(dataset: ForeignDataset, destination: Path, split: str | None, index: int | None) -> Exported:

@@ -20,7 +20,7 @@ from nmpm._support.machine import check_fits
 from nmpm._support.messages import install, one_line
 from nmpm.data.convert.base import UNKNOWN_LENGTH, Facts, Options, RunFiles, located, readable
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.stated import find_family
+from nmpm.data.metadata import find_family
 from nmpm.data.statistics import extent_of
 from nmpm.errors import ConfigError, DataError
 

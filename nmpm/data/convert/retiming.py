@@ -17,8 +17,8 @@ from scipy.signal import savgol_filter
 from nmpm._support.messages import counted
 from nmpm.data.array_checks import broken_frames, particles_far_away
 from nmpm.data.convert.base import UNKNOWN_LENGTH, ForeignDataset, Options
-from nmpm.data.facts import take_sample
 from nmpm.data.format import Metadata, Trajectory
+from nmpm.data.samples import take_sample
 from nmpm.data.times import (
     find_time_fault,
     increasing_frames,
