@@ -187,8 +187,8 @@ class RuntimeOptions(Command):
 
     Args:
         runtime: What computes the network: eager (torch, default), openvino (CPU, the extra of that name), windows
-            (for large scenes that are mostly empty){further}, or auto for the faster of eager and openvino here; or the
-            engine that computes all else: {engines}.
+            (for large scenes that are mostly empty){further}, or auto for the faster of eager and openvino here (in
+            rollout, of windows, too); or the engine that computes all else: {engines}.
     """
 
     runtime: Runtime = "eager"

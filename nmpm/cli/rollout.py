@@ -118,6 +118,6 @@ class RollOut(ModelOptions, DeviceOptions, ThreadsOptions, RuntimeOptions, Stric
 
         model = load_model(self.model, self.device, self.root)
         start = start_of(model, self)
-        model = start.model.optimized(self.runtime, self.precision)
+        model = start.model.optimized(self.runtime, self.precision, start.state)
         choose_threads(model, self.threads)
         sys.stdout.write(f"to look at them: {roll_out(dataclasses.replace(start, model=model), self)}\n")

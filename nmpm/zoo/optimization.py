@@ -25,6 +25,7 @@ _EXAMPLE = 300  # particles of the example by which runtimes are compared
 _SPEED = 0.2  # cells per frame, of the particles of the example: at rest, the network would have little to say
 _SHARE = 0.1  # of particles that may differ by more with constraints, whose thresholds amplify rounding
 _BUNDLES, _ROUNDS = 4, 3  # of the rollouts that are timed
+_LONG = 2.0  # seconds of timed rollouts after which no further one is
 _LOG = logging.getLogger(__name__)
 
 
@@ -42,12 +43,14 @@ def small_example(emulator: Emulator) -> Particles:
     return thrown_state(emulator, 0, fitting_count(emulator, _EXAMPLE)).to(emulator.device)
 
 
-def optimize(emulator: Emulator, runtime: str | Runtime) -> Emulator:
+def optimize(emulator: Emulator, runtime: str | Runtime, state: Particles | None = None) -> Emulator:
     """The emulator with another runtime, compared with torch on an example.
 
     Args:
         emulator: In evaluation mode.
         runtime: One of `RUNTIMES`, or its name, or that of one of `ENGINES`, or "auto".
+        state: By which "auto" measures times, those of runtimes that pay in some scenes only among them; if left out,
+            an example.
 
     Raises:
         ConfigError: if there is no such runtime, it cannot run the model here, or its results differ from torch's;
@@ -62,13 +65,14 @@ def optimize(emulator: Emulator, runtime: str | Runtime) -> Emulator:
     fitting = []
     for name in RUNTIMES:
         try:
-            if RUNTIMES[name].automatic:
+            if RUNTIMES[name].automatic or state is not None:
                 fitting.append(_checked(emulator, name))
         except ConfigError as error:
             _LOG.info("%s", error)
     if len(fitting) == 1:
         return fitting[0]
-    seconds = {faster.runtime.name: _seconds(faster, small_example(emulator)) for faster in fitting}
+    timed = small_example(emulator) if state is None else state.to(emulator.device)
+    seconds = {faster.runtime.name: _seconds(faster, timed) for faster in fitting}
     _LOG.info("Seconds of %d bundles: %s.", _BUNDLES, seconds)
     return min(fitting, key=lambda faster: seconds[faster.runtime.name])
 
@@ -106,9 +110,9 @@ def _with_engine(emulator: Emulator, name: str) -> Emulator:
 
 
 def _seconds(emulator: Emulator, state: Particles) -> float:
-    """The least time of a few rollouts, after one in which programs are compiled."""
-    times = []
-    for _ in range(1 + _ROUNDS):
+    """The least time of a few rollouts, after one in which programs are compiled; of one, where it takes long."""
+    times = list[float]()
+    while len(times) <= _ROUNDS and not sum(times[1:]) > _LONG:
         start = time.perf_counter()
         rollout(emulator, state, _BUNDLES * emulator.frames).cpu()  # waits for the device
         times.append(time.perf_counter() - start)

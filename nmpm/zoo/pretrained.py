@@ -304,7 +304,9 @@ class Pretrained:
         """As `fit_to`, for a scene such as `dataclasses.replace(model.scene, bounds=…, domain=…)`."""
         return self.fit_to(scene)
 
-    def optimized(self, runtime: str | Runtime = AUTO, precision: str | None = None) -> Pretrained:
+    def optimized(
+        self, runtime: str | Runtime = AUTO, precision: str | None = None, state: Particles | None = None
+    ) -> Pretrained:
         """The same model for inference alone, its network computed by a faster runtime than torch.
 
         One bundle of an example is compared with torch's. Programs are compiled in the first call for each batch and
@@ -317,12 +319,14 @@ class Pretrained:
                 which computes all else of a call. On a CUDA GPU calls by eager are recorded as CUDA graphs without
                 being asked.
             precision: As for `with_network`; the network's own if left out.
+            state: Of the scenes to roll out: "auto" measures in them, and tries windows, too, which pay where a large
+                grid is mostly empty.
 
         Raises:
             ConfigError: if the runtime is not installed, cannot run the model here, or computes something else.
         """
         model = self if precision is None else self.with_network(precision)
-        return dataclasses.replace(model, emulator=optimize(model.emulator, runtime))
+        return dataclasses.replace(model, emulator=optimize(model.emulator, runtime, state))
 
     def explain(self) -> None:
         """Print what computes rollouts and trainings on the model's device, and why nothing faster does."""

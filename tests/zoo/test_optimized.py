@@ -16,7 +16,7 @@ from nmpm.emulator import Bundle
 from nmpm.emulator.engines import find_engine
 from nmpm.emulator.engines.engine import EngineForm
 from nmpm.emulator.engines.torch.engine import TorchEngine
-from nmpm.emulator.runtimes import Eager, OpenVINO, Runtime
+from nmpm.emulator.runtimes import Eager, OpenVINO, Runtime, Windows
 from nmpm.errors import ConfigError
 from nmpm.registry import Registry
 from nmpm.transfer import without_kernels
@@ -57,6 +57,16 @@ def use(monkeypatch, **runtimes) -> None:
 def test_the_fastest_as_measured_is_taken(model, monkeypatch):
     use(monkeypatch, openvino=Slow, eager=Eager)
     assert model.optimized().emulator.runtime.name == "eager"
+
+
+def test_runtimes_that_pay_in_some_scenes_are_tried_in_a_given_one(model, monkeypatch):
+    seen = []
+    monkeypatch.setattr(optimization, "_seconds", lambda emulator, state: seen.append(state) or len(seen))
+    use(monkeypatch, windows=Windows, eager=Eager)
+    assert model.optimized().emulator.runtime.name == "eager"
+    state = model.example(count=50)
+    assert model.optimized(state=state).emulator.runtime.name == "windows"
+    assert all(torch.equal(one.position, state.position) for one in seen)
 
 
 def test_what_runs_here_is_taken_and_checked(model, caplog, monkeypatch):

@@ -37,7 +37,7 @@ class Runtime(ABC):
     fixed_shapes: ClassVar[bool] = True
     """Whether another shape of the state or of the grid costs a compilation."""
     automatic: ClassVar[bool] = True
-    """Whether `nmpm.zoo.optimization` tries it where the fastest is asked for."""
+    """Whether it may be the fastest in any scene; others are tried where times are measured in a given scene."""
 
     recordable: ClassVar[bool] = False
     """Whether CUDA graphs can hold calls in which it computes the network."""
