@@ -27,7 +27,7 @@ from nmpm import (
     transfer,
 )
 from nmpm.cli.command import sections
-from nmpm.cli.training import OPTIONS_FILE
+from nmpm.cli.training_options import OPTIONS_FILE
 from nmpm.training import losses
 
 PARTS = (processors, transfer, decoders, losses, optimizers, metrics)

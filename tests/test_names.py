@@ -15,7 +15,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from nmpm._support.shipped import PACKAGE
 from nmpm.cli import COMMANDS
 from nmpm.cli.command import Command, label
-from nmpm.cli.training import known_options
+from nmpm.cli.training_options import known_options
 
 
 def commands(kinds: Iterable[Any]) -> Iterator[type[Command]]:

@@ -13,7 +13,7 @@ from jsonargparse import Namespace
 
 from nmpm._support.plain_data import to_plain
 from nmpm.cli.options import MatchOptions, describe
-from nmpm.cli.training import read_options, stated_keys
+from nmpm.cli.training_options import read_options, stated_keys
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.dataset import Dataset
 from nmpm.data.sources import FolderSource

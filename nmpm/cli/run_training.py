@@ -40,7 +40,7 @@ from nmpm.cli.command import UsageError, argument_texts, explain
 from nmpm.cli.matched_run import MatchedRun, stored_scene
 from nmpm.cli.options import MatchOptions, check_folder
 from nmpm.cli.run_folder import CHECKPOINTS, CONFIG, SAVERS, RunFolder, next_folder
-from nmpm.cli.training import known_options, read_config
+from nmpm.cli.training_options import known_options, read_config
 from nmpm.cli.trust import OPTION, foreign_names, trust_advice
 from nmpm.data.datamodule import TrajectoryDataModule
 from nmpm.data.inspection import contradictions_warning

@@ -16,7 +16,7 @@ import pytest
 from nmpm import EmulatorModule
 from nmpm._support.shipped import user_home
 from nmpm.cli import COMMANDS, expand_home, main
-from nmpm.cli.training import OPTIONS_FILE, forget_unused_slurm
+from nmpm.cli.training_options import OPTIONS_FILE, forget_unused_slurm
 from nmpm.errors import ConfigError, DataError
 from nmpm.training.checkpoints import AtomicCheckpointIO
 from nmpm.training.preflight import check_disk

@@ -19,7 +19,7 @@ from nmpm._support.machine import computes_bfloat16
 from nmpm._support.shipped import config_names, find_config, shipped_folder
 from nmpm.cli import main
 from nmpm.cli.run_training import EmulatorCLI
-from nmpm.cli.training import known_options
+from nmpm.cli.training_options import known_options
 from nmpm.data.format import Split, write_metadata, write_split
 from nmpm.errors import ConfigError
 from nmpm.training import EmulatorModule
