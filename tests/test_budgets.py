@@ -13,7 +13,7 @@ house = runpy.run_path(str(HOUSE))
 ROOMS = {
     "_support": (1700, 13),
     "cli": (4200, 21),
-    "data": (15600, 63),
+    "data": (15650, 64),
     "emulator": (8400, 51),
     "evaluation": (4050, 27),
     "metrics": (700, 5),

@@ -13,7 +13,9 @@ from nmpm.registry import Registry
 PACKAGE = Path(__file__).parents[1]
 """The folder of the package."""
 SCENES: Registry[Path] = Registry(
-    "nmpm.scenes", "scene", {path.stem: path for path in sorted((PACKAGE / "sim" / "presets").glob("*.yaml"))}
+    "nmpm.scenes",
+    "scene",
+    {path.stem: path for path in sorted((PACKAGE / "sim" / "presets").glob("*.yaml"), key=lambda file: file.stem)},
 )
 """YAML files of the presets of simulators, by name; another package's entry point names a `Path`."""
 

@@ -14,11 +14,12 @@ from nmpm._support.messages import one_line, span
 from nmpm._support.progress import progress_bar
 from nmpm.data.array_checks import check_end
 from nmpm.data.dataset_checks import DatasetChecks, find_shared_runs
+from nmpm.data.families import guess_family
 from nmpm.data.fields import FieldFacts, FieldSurvey, Kind
 from nmpm.data.findings import Finding, Severity, merge_findings, sort_findings
 from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, find_split, split_paths, split_renames
 from nmpm.data.grid_rule import GridCost, GridFacts, Machine, grid_cost, recommended_cells
-from nmpm.data.metadata import FOUND, guess_family, load_json, parse_metadata
+from nmpm.data.metadata import FOUND, load_json, parse_metadata
 from nmpm.data.sources import FolderSource
 from nmpm.data.spacing import neighbour_distance
 from nmpm.data.statistics import MotionStatistics, extent_of, find_disagreements, notes_on_lengths

@@ -14,11 +14,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from nmpm._support.messages import span
 from nmpm._support.progress import progress_bar
 from nmpm.data.facts import find_facts
+from nmpm.data.families import FAMILIES
 from nmpm.data.format import Split, find_split, split_paths
 from nmpm.data.gravity import trajectory_gravity
 from nmpm.data.grid_rule import GridCost, GridFacts, Machine, TrainingSize, grid_cost, recommended_cells, training_size
 from nmpm.data.inspection import open_dataset
-from nmpm.data.metadata import FAMILIES, FOUND
+from nmpm.data.metadata import FOUND
 from nmpm.data.sources import FolderSource
 from nmpm.data.survey import RecordedMotion, Survey, smoothing_frames
 from nmpm.errors import DataError

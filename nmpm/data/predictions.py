@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nmpm._support import __version__
+from nmpm.data.families import FAMILIES
 from nmpm.data.format import TRUTH, Metadata, Trajectory
-from nmpm.data.metadata import FAMILIES, JsonKeys, parse_json, scene_metadata
+from nmpm.data.metadata import JsonKeys, parse_json, scene_metadata
 from nmpm.errors import ConfigError, DataError
 from nmpm.scene import Scene
 

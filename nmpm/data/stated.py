@@ -9,12 +9,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, ClassVar, Self, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Self, get_args
 
 from nmpm._support.messages import suggestion
-from nmpm.data.metadata import STATIC_NAMES, Metadata, find_family
+from nmpm.data.families import STATIC_NAMES, find_family
 from nmpm.errors import ConfigError
 from nmpm.scene import Boundary, Interval, check_field_names
+
+if TYPE_CHECKING:
+    from nmpm.data.metadata import Metadata
 
 AXES = "axes"
 """Key of `metadata.json`: the order of the axes of positions, where a user states it."""

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nmpm.data.families import guess_family, unambiguous_family
 from nmpm.data.format import METADATA_FILE, Metadata, read_metadata, write_metadata
-from nmpm.data.metadata import guess_family, unambiguous_family
 from nmpm.data.simulation import preset_metadata
 from nmpm.errors import ConfigError, DataError
 from nmpm.sim import load_preset

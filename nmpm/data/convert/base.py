@@ -23,8 +23,8 @@ import numpy as np
 
 from nmpm._support.bounded_files import check_regular
 from nmpm._support.messages import counted, install, one_line
+from nmpm.data.families import find_family
 from nmpm.data.format import ID, OTHER_NAMES, SPLITS, Metadata, Trajectory, is_no_data
-from nmpm.data.metadata import find_family
 from nmpm.data.stated import Options as Options
 from nmpm.errors import ConfigError, DataError, NmpmError
 

@@ -19,8 +19,8 @@ from nmpm._support.bounded_files import EXPANSION, check_regular, expansion_limi
 from nmpm._support.machine import check_fits
 from nmpm._support.messages import install, one_line
 from nmpm.data.convert.base import UNKNOWN_LENGTH, Facts, Options, RunFiles, located, readable
+from nmpm.data.families import find_family
 from nmpm.data.format import Metadata, Trajectory
-from nmpm.data.metadata import find_family
 from nmpm.data.statistics import extent_of
 from nmpm.errors import ConfigError, DataError
 

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from nmpm.data.convert.base import Facts, Options, Run, RunFiles, split_files
+from nmpm.data.families import unambiguous_family
 from nmpm.data.format import METADATA_FILE, SPLITS, Metadata, Split, Trajectory, read_metadata, split_paths
-from nmpm.data.metadata import unambiguous_family
 from nmpm.data.predictions import DESCRIPTION, read_description
 from nmpm.errors import NmpmError
 

@@ -19,9 +19,9 @@ import numpy as np
 
 from nmpm._support.machine import check_fits
 from nmpm.data.convert.base import UNKNOWN_LENGTH, Facts, ForeignDataset, Options, RunFiles, located
+from nmpm.data.families import find_family
 from nmpm.data.format import Metadata, Trajectory
 from nmpm.data.hdf5 import check_self_contained, check_stored_size, open_hdf5
-from nmpm.data.metadata import find_family
 from nmpm.data.statistics import extent_of, first_moving_particle
 from nmpm.errors import DataError
 from nmpm.scene import Interval
