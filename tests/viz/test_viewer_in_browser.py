@@ -257,7 +257,7 @@ def test_gifs_hold_the_colours_that_they_are_given(open_page, colours):
     palette = rng.integers(0, 256, (colours, 3))
     image = np.dstack([palette[rng.integers(colours, size=(150, 131))], np.full((150, 131), 255)]).astype(np.uint8)
     text = base64.b64encode(image.tobytes()).decode()
-    page.add_script_tag(content=f"{bundle('gif')} window.gif = modules.gif;", type="module")
+    page.add_script_tag(content=f"{bundle('gif')} window.gif = modules.gif;")
     made = page.evaluate(
         """async (text) => {
           const gif = new window.gif.Gif(131, 150);

@@ -128,7 +128,7 @@ def test_runtimes_are_choices_of_their_own(scenes):
     assert (plain.name, quick.name) == ("carried", "carried, openvino")
     assert quick.identity == dict(plain.identity) | {"runtime": "openvino"}
     wrong = dataclasses.replace(sweep, models=dataclasses.replace(settings, runtime=("fast",)))
-    with pytest.raises(ConfigError, match="No runtime is called 'fast'"):
+    with pytest.raises(ConfigError, match="There is no runtime 'fast'"):
         make_choices(wrong, scenes, models)
 
 
