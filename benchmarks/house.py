@@ -8,6 +8,7 @@ python benchmarks/house.py --trace    beside these the files and functions of th
 
 from __future__ import annotations
 
+import argparse
 import ast
 import collections
 import io
@@ -180,7 +181,9 @@ def trace(script: str) -> Any:
 
 
 if __name__ == "__main__":
-    result = count()
-    if "--trace" in sys.argv:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--trace", action="store_true")
+    options, result = parser.parse_args(), count()
+    if options.trace:
         result |= {name: trace(script) for name, script in TRACES.items()}
     print(json.dumps(result, indent=1))

@@ -7,6 +7,7 @@ The classes of model, data and trainer take seconds to import, so their argument
 
 from __future__ import annotations
 
+import argparse
 import inspect
 import json
 import re
@@ -87,4 +88,5 @@ def _classes(module: ModuleType) -> list[str]:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     OPTIONS_FILE.write_text(json.dumps(training_options(), indent=1) + "\n", encoding="utf-8")

@@ -1,12 +1,7 @@
-"""Kernels run on a CUDA GPU where there is one, and in Triton's interpreter elsewhere."""
-
-import os
+"""Where the tests of kernels run: on a CUDA GPU where there is one, see `plugins/conftest.py`."""
 
 import pytest
 import torch
-
-if not torch.cuda.is_available():
-    os.environ.setdefault("TRITON_INTERPRET", "1")  # read where Triton is imported
 
 
 @pytest.fixture(scope="session")
